@@ -8,26 +8,23 @@ from scipy.spatial.transform import Rotation
 
 from alice_survey.sim.vehicle.dynamics import rk4_step, scratch_for
 from alice_survey.sim.vehicle.navigation.sensors import SensorSuite
-from alice_survey.sim.vehicle.pilot.gains import gains_for
 from alice_survey.sim.vehicle.pilot.memory import APPROACH, ASCEND, DIVE, DONE, FOLLOW, PHASE
-from alice_survey.sim.vehicle.pilot.path import path_from_legs
 from alice_survey.sim.vehicle.pilot.settings import pilot_guidance
 from alice_survey.sim.vehicle.sea import Disturbance, constant_current, level_floor
 from alice_survey.sim.vehicle.simulator import STEPS, TICK_S, Flown, Setup, simulate
 from alice_survey.sim.vehicle.vehicle import vehicle_from
+from tests.alice_survey.sim.vehicle.pilot.pilot_runs import gains_of, straight
 
 CURRENT = constant_current(0.1, 60.0)
 STILL = Disturbance()
 GUSTS = Disturbance(sigma=(3.0, 3.0, 3.0, 0.0, 0.0, 0.0))
 
 
-def setup(disturbance: Disturbance = STILL, failed: str | None = None) -> Setup:
+def setup(disturbance: Disturbance = STILL) -> Setup:
     """A line of 6 m, 2 m above a floor at 5 m."""
-    craft = vehicle_from("alice")
-    path = path_from_legs([(0.0, 0.0)], [0.3], [6.0], [0.0], [0], 2.0, 0.2)
-    gains = gains_for(craft, 0.2)
+    path, gains = straight(6.0, 0.3), gains_of("alice")
     return Setup(
-        vehicle=craft,
+        vehicle=vehicle_from("alice"),
         path=path,
         guidance=pilot_guidance(gains, path, "sway", max_depth_m=5.0),
         gains=gains,
@@ -35,7 +32,6 @@ def setup(disturbance: Disturbance = STILL, failed: str | None = None) -> Setup:
         floor=level_floor(5.0),
         current=CURRENT,
         disturbance=disturbance,
-        health={} if failed is None else {failed: 0.0},
         start_heading_rad=0.3,
     )
 
@@ -64,9 +60,8 @@ def test_the_recorded_velocity_is_that_of_the_recorded_positions(calm: Flown) ->
     mean = 0.5 * (calm.truth[1:, 7:10] + calm.truth[:-1, 7:10])
     # The trapezium rule's error is the change of acceleration within a tick.
     assert np.abs(way / TICK_S - mean).max() < 2e-3
-    turned = Rotation.from_quat(calm.truth[:-1, 3:7]).inv() * Rotation.from_quat(
-        calm.truth[1:, 3:7]
-    )
+    attitude = Rotation.from_quat(calm.truth[:, 3:7])
+    turned = attitude[:-1].inv() * attitude[1:]
     rates = 0.5 * (calm.truth[1:, 10:13] + calm.truth[:-1, 10:13])
     assert np.abs(turned.as_rotvec() / TICK_S - rates).max() < 5e-3
 

@@ -185,44 +185,41 @@ def straight(length_m: float, heading_rad: float = 0.0, speed_mps: float = 0.2) 
     return path_from_legs([(0.0, 0.0)], [heading_rad], [length_m], [0.0], [0], 2.0, speed_mps)
 
 
-def lawnmower(lines: int, length_m: float, speed_mps: float = 0.2, run_m: float = 0.5) -> Path:
-    """Lines 1 m apart, to and fro along north, with half circles between their run-ins."""
-    legs: list[tuple[tuple[float, float], float, float, float, int]] = []
-    heading = 0.0
-    for i in range(lines):
-        low, high, way = (
-            (-run_m, length_m + run_m, 1) if i % 2 == 0 else (length_m + run_m, -run_m, -1)
-        )
-        legs.append(((low, float(i)), heading, run_m, 0.0, -1))
-        legs.append(((low + way * run_m, float(i)), heading, length_m, 0.0, i))
-        legs.append(((high - way * run_m, float(i)), heading, run_m, 0.0, -1))
-        if i + 1 < lines:
-            legs.append(((high, float(i)), heading, math.pi / 2, 2.0 * way, -1))
-            heading += way * math.pi
-    start, headings, length, curvature, line = zip(*legs, strict=True)
-    return path_from_legs(start, headings, length, curvature, line, 2.0, speed_mps)
-
-
 Move = tuple[str, float] | tuple[str, float, int]
 
 
-def with_stops(moves: Sequence[Move], heading_rad: float = 0.0, speed_mps: float = 0.2) -> Path:
-    """A path of moves: ("go", m) with a line's index if it is one, ("spot", rad), ("step", m)."""
-    place, heading = np.zeros(2), heading_rad
+def lawnmower(lines: int, length_m: float, speed_mps: float = 0.2) -> Path:
+    """Lines 1 m apart, to and fro along north, with half circles between their run-ins."""
+    moves: list[Move] = []
+    for i in range(lines):
+        half_circle = ("arc", math.pi if i % 2 == 0 else -math.pi)
+        moves += [("go", 0.5), ("go", length_m, i), ("go", 0.5), half_circle]
+    return with_stops(moves[:-1], (-0.5, 0.0), speed_mps)
+
+
+def with_stops(
+    moves: Sequence[Move], start_ne: tuple[float, float] = (0.0, 0.0), speed_mps: float = 0.2
+) -> Path:
+    """A path of moves, northwards first.
+
+    ("go", m) with a line's index if it is one, ("arc", rad) of 0.5 m, ("spot", rad), ("step", m).
+    """
+    place, heading = np.array(start_ne), 0.0
     rows = []
     for kind, amount, *line in moves:
         turn = amount if kind == "spot" else 0.0
         side = -math.copysign(math.pi / 2, amount) if kind == "step" else 0.0
-        length = 0.0 if kind == "spot" else abs(amount)
-        rows.append(
-            (tuple(place), heading - side, length, 0.0, line[0] if line else -1, turn, side)
-        )
-        place = place + length * np.array([math.cos(heading - side), math.sin(heading - side)])
-        heading += turn
-    start, headings, lengths, curvature, lines, turns, sides = zip(*rows, strict=True)
-    return path_from_legs(
-        start, headings, lengths, curvature, lines, 2.0, speed_mps, turns, sides
-    )  # fmt: skip
+        arc = amount if kind == "arc" else 0.0
+        length = {"spot": 0.0, "arc": abs(arc) / 2}.get(kind, abs(amount))
+        curvature = math.copysign(2.0, arc) if arc else 0.0
+        course = heading - side
+        rows.append((tuple(place), course, length, curvature, line[0] if line else -1, turn, side))
+        chord = length * np.sinc(arc / (2 * math.pi))
+        middle = course + arc / 2
+        place = place + chord * np.array([math.cos(middle), math.sin(middle)])
+        heading += turn + arc
+    start, headings, lengths, curvatures, lines, turns, sides = zip(*rows, strict=True)
+    return path_from_legs(start, headings, lengths, curvatures, lines, 2.0, speed_mps, turns, sides)
 
 
 def launch(
