@@ -19,27 +19,29 @@ def inflow_mps(thruster: Thruster, nu: Array) -> float:
     return float(np.dot(local, thruster.direction_body))
 
 
-def open_thrust_n(thruster: Thruster, density: float, n: float, nu: Array) -> float:
-    """T_0 = rho n^2 D^4 K_T(J), the textbook form, with K_T falling linearly in J."""
+def _law(
+    thruster: Thruster, density: float, n: float, nu: Array, ends: tuple[float, float], slope: float
+) -> float:
+    """rho n^2 D^4 K(J), the textbook form, with K falling linearly in J from its end at rest."""
     if n == 0:
         return 0.0
     d = thruster.diameter_m
     advance = (1 - thruster.wake_fraction) * inflow_mps(thruster, nu) / (n * d)
-    at_rest = thruster.kt_forward if n > 0 else -thruster.kt_reverse
+    at_rest = ends[0] if n > 0 else -ends[1]
     # Astern J changes its sign with n, and the loss with |n| stays a loss of forward thrust.
-    return (
-        density * n**2 * d**4 * (at_rest - math.copysign(1, n) * thruster.advance_slope * advance)
-    )
+    return density * n**2 * d**4 * (at_rest - math.copysign(1, n) * slope * advance)
+
+
+def open_thrust_n(thruster: Thruster, density: float, n: float, nu: Array) -> float:
+    """T_0 = rho n^2 D^4 K_T(J)."""
+    ends = thruster.kt_forward, thruster.kt_reverse
+    return _law(thruster, density, n, nu, ends, thruster.advance_slope)
 
 
 def torque_nm(thruster: Thruster, density: float, n: float, nu: Array) -> float:
     """Q = rho n^2 D^5 K_Q(J) on the propeller, along its axis."""
-    if n == 0:
-        return 0.0
-    d = thruster.diameter_m
-    advance = (1 - thruster.wake_fraction) * inflow_mps(thruster, nu) / (n * d)
-    at_rest = thruster.kq_forward if n > 0 else -thruster.kq_reverse
-    return density * n**2 * d**5 * (at_rest - math.copysign(1, n) * thruster.torque_slope * advance)
+    ends = thruster.kq_forward, thruster.kq_reverse
+    return thruster.diameter_m * _law(thruster, density, n, nu, ends, thruster.torque_slope)
 
 
 def jet_speed_mps(thruster: Thruster, density: float, thrust_n: float) -> float:
