@@ -74,15 +74,12 @@ def test_configuration_matrix_is_the_thrusters_at_work(name: str) -> None:
 
 
 def test_rigid_inertia_of_two_weights_by_hand() -> None:
-    """2 kg, 1 m ahead of the origin: 2 kg m^2 about y and z, and the coupling of v to r."""
-    point = RigidBody(
-        dry_kg=2.0,
-        buoyancy_kg=2.0,
-        entrained_kg=0.0,
-        cg_body_m=(1.0, 0.0, 0.0),
-        inertia_kg_m2=(0.0, 0.0, 0.0),
-    )
-    expected = np.diag([2.0, 2.0, 2.0, 0.0, 2.0, 2.0])
+    """2 kg, 1 m ahead of the origin: 2 kg m^2 about y and z, and the coupling of v to r.
+
+    On top of them 1, 6 and 7 kg m^2 about its own centre.
+    """
+    point = block(cg=(1.0, 0.0, 0.0), dry_kg=2.0, buoyancy_kg=2.0).rigid_body
+    expected = np.diag([2.0, 2.0, 2.0, 0.0 + 1.0, 2.0 + 6.0, 2.0 + 7.0])
     expected[1, 5] = expected[5, 1] = 2.0  # turning to starboard moves the weight to starboard
     expected[2, 4] = expected[4, 2] = -2.0  # nose up moves it up
     np.testing.assert_array_equal(point.mass_matrix, expected)

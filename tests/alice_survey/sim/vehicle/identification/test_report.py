@@ -77,14 +77,9 @@ def test_a_log_is_predicted_open_loop_by_what_was_identified(
 ) -> None:
     """The whole log without a fit: buoyancy of the file counts, its current is of another day."""
     net_n = float(KNOWN.plant.body.buoyancy_n - KNOWN.plant.body.weight_n)
-    (tmp_path / "found.json").write_text(
-        json.dumps(
-            {
-                "values": {**KNOWN.coefficients.values, **TRUTH},
-                "others": {"net_buoyancy_n": net_n, "current_north_mps": 3.0},
-            }
-        )
-    )
+    others = {"net_buoyancy_n": net_n, "current_north_mps": 3.0}
+    found = {"values": {**KNOWN.coefficients.values, **TRUTH}, "others": others}
+    (tmp_path / "found.json").write_text(json.dumps(found))
     arguments = [
         "--coefficients", str(tmp_path / "found.json"), "--held", "current_north_mps=-0.05",
         "--held", "current_east_mps=0.1", "-o", str(tmp_path / "out"), "--json",
@@ -155,10 +150,9 @@ def test_the_fit_is_as_defined() -> None:
 
 
 def test_the_truth_predicts_itself_and_a_wrong_model_does_not() -> None:
-    truth = flown.hidden({"X_uu": -12.0, "N_rr": -70.0})
-    log = flown.fly(truth, duration_s=40.0, current=(0.1, 0.05))
-    parameters = free_parameters(vehicle_from("alice"), ("X_uu", "N_rr", "current"))
-    windows = make_windows(log, vehicle_from("alice"), window_s=10.0)
+    log = flown.fly(flown.hidden(TRUTH), duration_s=40.0, current=(0.1, 0.05))
+    parameters = free_parameters(KNOWN, (*TRUTH, "current"))
+    windows = make_windows(log, KNOWN, window_s=10.0)
     right = validate(windows, parameters, np.array([-12.0, -70.0, 0.1, 0.05]))
     wrong = validate(windows, parameters, np.array([-24.0, -35.0, 0.1, 0.05]))
     assert np.all(right.fit_percent > 99.0)
@@ -168,10 +162,8 @@ def test_the_truth_predicts_itself_and_a_wrong_model_does_not() -> None:
 
 
 def test_a_motion_that_follows_the_log_is_not_scored() -> None:
-    windows = make_windows(
-        flown.fly(flown.hidden({}), duration_s=10.0), vehicle_from("alice"), given=("p", "q")
-    )
-    parameters = free_parameters(vehicle_from("alice"), ("X_uu",))
+    windows = make_windows(flown.fly(KNOWN, duration_s=10.0), KNOWN, given=("p", "q"))
+    parameters = free_parameters(KNOWN, ("X_uu",))
     found = validate(windows, parameters, parameters.start)
     assert np.all(np.isnan(found.fit_percent[3:5]))
     assert np.all(found.fit_percent[[0, 1, 2, 5]] > 99.0)
