@@ -224,13 +224,10 @@ def test_restoring_moments_by_hand() -> None:
 
 
 def test_heavier_nose_pitches_down_and_heavier_starboard_rolls_to_it() -> None:
-    nose = m.block(cg=(0.02, 0.0, 0.0))
-    assert m.rates(nose, m.state_of(nose))[m.M] == pytest.approx(
-        -50.0 * GRAVITY * 0.02 / 6.0, rel=1e-9
-    )
-    starboard = m.block(cg=(0.0, 0.02, 0.0))
-    rate = m.rates(starboard, m.state_of(starboard))
-    assert rate[m.K] == pytest.approx(50.0 * GRAVITY * 0.02 / 1.0, rel=1e-9)
+    nose, starboard = m.block(cg=(0.02, 0.0, 0.0)), m.block(cg=(0.0, 0.02, 0.0))
+    moment = 50.0 * GRAVITY * 0.02
+    assert m.rates(nose, m.state_of(nose))[m.M] == pytest.approx(-moment / 6.0, rel=1e-9)
+    assert m.rates(starboard, m.state_of(starboard))[m.K] == pytest.approx(moment / 1.0, rel=1e-9)
 
 
 def test_munk_moment_turns_the_body_broadside() -> None:

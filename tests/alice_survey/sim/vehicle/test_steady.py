@@ -12,22 +12,14 @@ from tests.alice_survey.sim.vehicle import motions as m
 
 ALICE, SPARUS = vehicle_from("alice"), vehicle_from("sparus2")
 
-RNG = np.random.default_rng(1)
-
-
-def _planar() -> np.ndarray:
-    """Motions of a survey: surge, sway, a little heave, turning."""
-    nu = np.zeros((30, 6))
-    nu[:, 0] = RNG.uniform(-0.2, 0.6, 30)
-    nu[:, 1] = RNG.uniform(-0.25, 0.25, 30)
-    nu[:, 2] = RNG.uniform(-0.05, 0.05, 30)
-    nu[:, 5] = RNG.uniform(-0.2, 0.2, 30)
-    return nu
-
 
 def test_the_compiled_dynamics_stay_as_they_are_at_the_steady_thrust() -> None:
-    """No acceleration is left in surge, sway, heave and yaw: force, N and N m, below 1e-6."""
-    nu = _planar()
+    """No acceleration is left in surge, sway, heave and yaw: force, N and N m, below 1e-6.
+
+    In motions of a survey: surge, sway, a little heave, turning.
+    """
+    ends = np.array([[-0.2, -0.25, -0.05, 0, 0, -0.2], [0.6, 0.25, 0.05, 0, 0, 0.2]])
+    nu = np.random.default_rng(1).uniform(*ends, (30, 6))
     flight = steady_flight(ALICE, nu)
     assert np.all(np.isfinite(flight.power_w))
     for motion, rps in zip(nu, flight.rps, strict=True):
@@ -37,8 +29,7 @@ def test_the_compiled_dynamics_stay_as_they_are_at_the_steady_thrust() -> None:
 
 def test_power_of_a_sound_figure_is_known() -> None:
     """0.2 m/s ahead: 15.23 x 0.04 N of drag, and 0.98 N of buoyancy held down."""
-    nu = np.zeros((1, 6))
-    nu[0, 0] = 0.2
+    nu = 0.2 * m.U[None]
     flight = steady_flight(ALICE, nu)
     assert m.drag_power(ALICE.plant.body, nu)[0] == pytest.approx(15.23 * 0.2**3, rel=1e-12)
     made = np.zeros(6)
@@ -71,8 +62,7 @@ def test_turning_while_the_water_stands_still_over_ground_takes_its_acceleration
 
 
 def test_a_share_of_thrust_bounds_the_load() -> None:
-    nu = np.zeros((60, 6))
-    nu[:, 1] = np.linspace(0.01, 0.6, 60)
+    nu = np.linspace(0.01, 0.6, 60)[:, None] * m.V
     whole, part = steady_flight(ALICE, nu), steady_flight(ALICE, nu, share=0.5)
     kept = np.isfinite(part.power_w)
     assert 10 < kept.sum() < np.isfinite(whole.power_w).sum() < 60
@@ -83,8 +73,7 @@ def test_a_share_of_thrust_bounds_the_load() -> None:
 
 
 def test_one_lateral_thruster_is_made_up_for_by_the_pair_astern() -> None:
-    nu = np.zeros((1, 6))
-    nu[0, :2] = 0.2, 0.08
+    nu = np.array([[0.2, 0.08, 0, 0, 0, 0]])
     sound, lame = steady_flight(ALICE, nu), steady_flight(ALICE.without(["bow"]), nu)
     assert lame.power_w[0] > 2 * sound.power_w[0]
     assert math.isfinite(lame.power_w[0])
