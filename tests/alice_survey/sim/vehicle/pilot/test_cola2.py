@@ -83,10 +83,8 @@ def test_the_captain_waits_twice_the_way_and_half_a_minute() -> None:
         30 + 2 * math.sqrt(2) * 10 / 0.2
     )
     assert pilot.timeout_s(row, 1.0, -12.0, settings) == pytest.approx(30 + 2 * 12 / 0.3)
-    row[[pilot.BY_DEPTH, pilot.BY_ALTITUDE]] = (
-        0.0,
-        1.0,
-    )  # by altitude: as if through the range of a DVL
+    # By altitude: as if through the range of a DVL.
+    row[[pilot.BY_DEPTH, pilot.BY_ALTITUDE]] = 0.0, 1.0
     assert pilot.timeout_s(row, 10.0, 1.0, settings) == pytest.approx(30 + 2 * 200 / 0.3)
     row[pilot.SPEED] = 3.0  # no faster than the pilot's parameter
     assert pilot.timeout_s(row, 900.0, 1.0, settings) == pytest.approx(
