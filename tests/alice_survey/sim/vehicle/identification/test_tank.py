@@ -25,6 +25,9 @@ FREE = (
 )  # fmt: skip
 """The thrusts of the data set are a curve of the pulses, not calibrated: their scale is free. The
 added mass is that of the vehicle's file, since only its ratio to the scale can be seen."""
+ROV = vehicle_from_file(HERE / "bluerov2.toml")
+PARAMETERS = free_parameters(ROV, FREE)
+MOVING = [0, 1, 2, 5]
 
 
 @pytest.fixture(scope="module")
@@ -54,29 +57,23 @@ def test_frames_and_step_of_the_runs_are_as_mapped(runs: list[VehicleLog]) -> No
 @pytest.mark.slow
 @pytest.mark.parametrize("left_out", [0, 1, 2, 3])
 def test_each_run_is_predicted_from_the_others(runs: list[VehicleLog], left_out: int) -> None:
-    rov = vehicle_from_file(HERE / "bluerov2.toml")
-    parameters = free_parameters(rov, FREE)
     # Rolling and pitching answer to nothing in the log: they follow it.
     windows = [
         window
         for k, run in enumerate(runs)
         if k != left_out
-        for window in make_windows(run, rov, window_s=5.0, given=("p", "q"))
+        for window in make_windows(run, ROV, window_s=5.0, given=("p", "q"))
     ]
-    fit = fit_output_error(windows, parameters, max_step_s=QUICK_S)
-    shorter = make_windows(runs[left_out], rov, window_s=10.0, given=("p", "q"))
-    found = validate(shorter, parameters, fit.values, max_step_s=QUICK_S)
-    moving = [0, 1, 2, 5]
-    model, constant = found.fit_percent[moving], found.constant_fit_percent[moving]
+    fit = fit_output_error(windows, PARAMETERS, max_step_s=QUICK_S)
+    shorter = make_windows(runs[left_out], ROV, window_s=10.0, given=("p", "q"))
+    found = validate(shorter, PARAMETERS, fit.values, max_step_s=QUICK_S)
+    model, constant = found.fit_percent[MOVING], found.constant_fit_percent[MOVING]
     assert np.all(model > 20.0)
     assert np.all(model < 90.0)
     assert np.all(model > constant + 30.0)
     # All in all better than the published coefficients, too.
-    published = validate(shorter, parameters, parameters.start, max_step_s=QUICK_S)
-    assert model.mean() > published.fit_percent[moving].mean() + 10.0
-
-
-MOVING = [0, 1, 2, 5]
+    published = validate(shorter, PARAMETERS, PARAMETERS.start, max_step_s=QUICK_S)
+    assert model.mean() > published.fit_percent[MOVING].mean() + 10.0
 
 
 @pytest.fixture(scope="module", params=[None, PriorSigmas()], ids=["no prior", "prior"])
@@ -84,11 +81,9 @@ def single(
     runs: list[VehicleLog], request: pytest.FixtureRequest
 ) -> tuple[PriorSigmas | None, list[OutputErrorFit]]:
     """A fit to each run alone."""
-    rov = vehicle_from_file(HERE / "bluerov2.toml")
-    parameters = free_parameters(rov, FREE)
     fits = [
         fit_output_error(
-            make_windows(run, rov, window_s=5.0, given=("p", "q")), parameters,
+            make_windows(run, ROV, window_s=5.0, given=("p", "q")), PARAMETERS,
             max_step_s=QUICK_S, prior=request.param,
         )
         for run in runs
@@ -102,16 +97,12 @@ def test_unseen_runs_are_not_predicted_worse_than_by_the_start(
 ) -> None:
     """Each run alone predicts the three others: with the prior never worse than the start does."""
     prior, fits = single
-    rov = vehicle_from_file(HERE / "bluerov2.toml")
     gains, model = [], []
     for k, run in enumerate(runs):
-        windows = make_windows(run, rov, window_s=10.0, given=("p", "q"))
+        windows = make_windows(run, ROV, window_s=10.0, given=("p", "q"))
         start, *others = (
-            validate(windows, fits[0].parameters, values, max_step_s=QUICK_S).fit_percent[MOVING]
-            for values in (
-                fits[0].parameters.start,
-                *(fit.values for j, fit in enumerate(fits) if j != k),
-            )
+            validate(windows, PARAMETERS, values, max_step_s=QUICK_S).fit_percent[MOVING]
+            for values in (PARAMETERS.start, *(fit.values for fit in fits[:k] + fits[k + 1 :]))
         )
         gains += [other - start for other in others]
         model += others
