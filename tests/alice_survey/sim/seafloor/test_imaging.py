@@ -1,9 +1,7 @@
 import csv
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -13,7 +11,7 @@ from shapely.geometry import MultiPolygon, box
 
 from alice_survey.app.stages import spec
 from alice_survey.core.artefacts import Stage, run_stage, write_csv, write_json
-from alice_survey.core.config import SurveyConfig, parse_config
+from alice_survey.core.config import SurveyConfig
 from alice_survey.core.errors import NavigationError
 from alice_survey.core.executor import SERIAL, local_executor
 from alice_survey.core.frames import interpolate_poses, rotation_from_attitude
@@ -23,24 +21,14 @@ from camera_calib.rig import read_rig
 from tests.missions.flown_plans import plan_of, walk
 
 TIMES_S = (2.0, 4.25, 6.5)
+SETTINGS = SurveyConfig.model_validate(
+    {"seed": 5, "seafloor": {"grid_m": 0.02}, "imaging": {"scale": 16, "pool_views": 8}}
+)
 NAVIGATION_COLUMNS = (
     "time_s", "latitude_deg", "longitude_deg", "depth_m", "roll_deg", "pitch_deg", "heading_deg",
     "altitude_m", "sigma_horizontal_m", "sigma_depth_m", "sigma_attitude_deg", "sigma_heading_deg",
     "sigma_altitude_m",
 )  # fmt: skip
-
-
-def settings(**imaging_: Any) -> SurveyConfig:
-    data = {
-        "seed": 5,
-        "seafloor": {"grid_m": 0.02},
-        "imaging": {"scale": 16, "pool_views": 8, **imaging_},
-    }
-    return parse_config(data, "test")
-
-
-def put_stage(workspace: Path, name: str, work: Callable[[Path], None]) -> None:
-    run_stage(workspace, Stage(name=name, version=1, settings={}), work)
 
 
 def fly(workspace: Path, until_s: float = 9.0) -> None:
@@ -74,8 +62,8 @@ def fly(workspace: Path, until_s: float = 9.0) -> None:
         ])  # fmt: skip
         write_csv(folder / "navigation.csv", NAVIGATION_COLUMNS, rows.tolist())
 
-    put_stage(workspace, "plan", plan)
-    put_stage(workspace, "flight", flight)
+    for name, work in (("plan", plan), ("flight", flight)):
+        run_stage(workspace, Stage(name=name, version=1, settings={}), work)
 
 
 def pose_of(row: dict[str, str]) -> RigidTransform:
@@ -99,7 +87,7 @@ def content(folder: Path) -> dict[str, bytes]:
 def survey(tmp_path_factory: pytest.TempPathFactory) -> Path:
     workspace = tmp_path_factory.mktemp("survey")
     fly(workspace)
-    assert spec("image").make(workspace, settings(), SERIAL)
+    assert spec("image").make(workspace, SETTINGS, SERIAL)
     return workspace
 
 
@@ -148,11 +136,11 @@ def test_truth_holds_the_poses_that_were_flown(survey: Path) -> None:
 
 def test_two_processes_give_the_same_bytes_as_one(survey: Path, tmp_path: Path) -> None:
     fly(tmp_path)
-    assert spec("image").make(tmp_path, settings(), local_executor(2))
+    assert spec("image").make(tmp_path, SETTINGS, local_executor(2))
     assert content(tmp_path / "images") == content(survey / "images")
 
 
 def test_a_flight_that_ends_before_its_triggers_is_refused(tmp_path: Path) -> None:
     fly(tmp_path, until_s=5.0)
     with pytest.raises(NavigationError, match=r"4\.90 s.* 6\.50"):
-        spec("image").make(tmp_path, settings(), SERIAL)
+        spec("image").make(tmp_path, SETTINGS, SERIAL)
