@@ -11,6 +11,7 @@ from alice_survey.core.errors import VehicleError
 from alice_survey.sim.vehicle import vehicle as files
 from alice_survey.sim.vehicle.coefficients import Coefficients
 from alice_survey.sim.vehicle.propulsion import add_thrust
+from alice_survey.sim.vehicle.sea import GRAVITY
 from alice_survey.sim.vehicle.vehicle import SETS, RigidBody, vehicle_from
 from tests.alice_survey.sim.vehicle.motions import block
 from tests.oracles_shape import ALICE, SPARUS2
@@ -50,6 +51,14 @@ def test_rigid_inertia_holds_the_energy_of_its_parts(
     matrix = body.mass_matrix
     assert 0.5 * np.array(nu) @ matrix @ np.array(nu) == pytest.approx(energy, rel=1e-9, abs=1e-12)
     np.testing.assert_allclose(matrix, matrix.T, atol=1e-13)
+
+
+def test_the_plant_holds_weight_buoyancy_and_inertia() -> None:
+    vehicle = block({"X_udot": -3.0}, dry_kg=52.5, buoyancy_kg=52.0, entrained_kg=20.0)
+    body = vehicle.plant.body
+    assert body.weight_n == 52.5 * GRAVITY and body.buoyancy_n == 52.0 * GRAVITY
+    assert vehicle.mass[0, 0] == 52.5 + 20.0 + 3.0
+    np.testing.assert_allclose(body.mass_inverse @ vehicle.mass, np.eye(6), atol=1e-14)
 
 
 def test_an_inertia_that_is_not_positive_is_refused() -> None:
