@@ -18,8 +18,8 @@ def test_the_compiled_dynamics_stay_as_they_are_at_the_steady_thrust() -> None:
 
     In motions of a survey: surge, sway, a little heave, turning.
     """
-    ends = np.array([[-0.2, -0.25, -0.05, 0, 0, -0.2], [0.6, 0.25, 0.05, 0, 0, 0.2]])
-    nu = np.random.default_rng(1).uniform(*ends, (30, 6))
+    low, high = [-0.2, -0.25, -0.05, 0, 0, -0.2], [0.6, 0.25, 0.05, 0, 0, 0.2]
+    nu = np.random.default_rng(1).uniform(low, high, (30, 6))
     flight = steady_flight(ALICE, nu)
     assert np.all(np.isfinite(flight.power_w))
     for motion, rps in zip(nu, flight.rps, strict=True):
