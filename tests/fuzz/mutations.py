@@ -146,11 +146,9 @@ def _line(data: bytes, rng: Random) -> bytes:
 
 def _token(data: bytes, rng: Random) -> bytes:
     """Another number or word."""
-    tokens = list(re.finditer(rb"[-+.\w]+", data))
-    if not tokens:
-        return data + _word(rng)
-    token = rng.choice(tokens)
-    return data[: token.start()] + _word(rng) + data[token.end() :]
+    places = [token.span() for token in re.finditer(rb"[-+.\w]+", data)]
+    start, end = rng.choice(places or [(len(data), len(data))])
+    return data[:start] + _word(rng) + data[end:]
 
 
 def _ends_of_lines(data: bytes, rng: Random) -> bytes:

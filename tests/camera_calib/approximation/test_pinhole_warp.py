@@ -1,5 +1,4 @@
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
@@ -12,6 +11,7 @@ from camera_calib.camera import Camera
 from camera_calib.lenses.fisheye import FisheyeLens
 from tests.camera_calib.approximation.ports import STUDY, behind_port
 
+LEANING = best_warp(behind_port(50, 15, tilt_deg=2.0), 1.5, 2.5)
 DEPTHS_M = np.linspace(1.5, 2.5, 5)
 
 
@@ -31,6 +31,8 @@ def test_residuals_are_those_of_the_design_study(
 
     leaning = best_warp(behind_port(port, glass, tilt_deg=2.0), 1.5, 2.5)
     assert rms(leaning) == pytest.approx(tilted, rel=0.08)
+    assert leaning.working_range_m == pytest.approx(1.875)  # where the warp is exact
+    assert residual_px(leaning, np.array([1.875])).max() < 1e-9
 
 
 @pytest.mark.parametrize(("port", "tilt_deg"), [(20, 0.0), (20, 2.0), (100, 2.0)])
@@ -55,6 +57,11 @@ def test_a_camera_of_one_centre_is_its_own_pinhole() -> None:
     assert warp.pinhole.size_px == warp.size_px
     assert residual_px(warp, DEPTHS_M).max() == 0.0
     assert warp.cut_share == 0.0
+
+    # Through a port without thickness on the pupil all rays meet in it, and any range fits.
+    thin = best_warp(behind_port(0, 0), 1.5, 2.5)
+    np.testing.assert_allclose(thin.centre_m, 0.0, atol=1e-9)
+    assert residual_px(thin, DEPTHS_M).max() < 0.01
 
 
 def test_the_pinhole_keeps_the_ground_resolution_on_the_axis_and_all_of_the_frame() -> None:
@@ -86,7 +93,7 @@ def test_a_wide_lens_is_cut_at_the_largest_growth() -> None:
 @given(x=st.floats(0, 3384), y=st.floats(0, 2710), depth_m=st.floats(0.5, 10))
 def test_the_pinhole_sees_what_the_camera_sees(x: float, y: float, depth_m: float) -> None:
     """Against the point itself, traced through the port and projected by the pinhole."""
-    warp = leaning_warp()
+    warp = LEANING
     taken = np.array([x, y])
     point = warp.camera.at_depth(taken, depth_m)
     seen = warp.to_pinhole(taken, depth_m)
@@ -100,23 +107,3 @@ def test_the_pinhole_sees_what_the_camera_sees(x: float, y: float, depth_m: floa
     np.testing.assert_allclose(
         np.append(offset + slope * z, z), point - np.array(warp.centre_m), atol=1e-12
     )
-
-
-@cache
-def leaning_warp() -> PinholeWarp:
-    return best_warp(behind_port(50, 15, tilt_deg=2.0), 1.5, 2.5)
-
-
-def test_the_warp_is_exact_at_the_working_range() -> None:
-    warp = best_warp(behind_port(50, 15, tilt_deg=1.0), 1.5, 2.5)
-
-    assert warp.working_range_m == pytest.approx(1.875)
-    assert residual_px(warp, np.array([1.875])).max() < 1e-9
-
-
-def test_a_port_of_no_thickness_on_the_pupil_moves_only_by_refraction() -> None:
-    warp = best_warp(behind_port(0, 0), 1.5, 2.5)
-
-    # All rays meet in the pupil: any range fits without parallax.
-    np.testing.assert_allclose(warp.centre_m, 0.0, atol=1e-9)
-    assert residual_px(warp, DEPTHS_M).max() < 0.01

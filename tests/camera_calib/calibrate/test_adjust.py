@@ -144,7 +144,6 @@ def test_it_finds_the_minimum_and_the_covariance_that_a_plain_solver_finds() -> 
     assert found.weights[np.isfinite(found.weights)].min() > 0.2
 
     covariance = found.rig.covariance
-    assert covariance is not None
     names = covariance.parameters
     # Robust weights belong to the loss: the twin minimises the same weighted squares.
     roots = np.sqrt(found.weights)[..., None] * np.ones(2)

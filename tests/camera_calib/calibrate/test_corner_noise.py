@@ -19,7 +19,7 @@ from camera_calib.calibrate.adjust import adjust
 from camera_calib.calibrate.corner_noise import spread_of
 from camera_calib.calibrate.normal_equations import CalibrationProblem
 from camera_calib.calibrate.solve import recalibrate
-from camera_calib.calibration import Calibration, TargetView, stack_views
+from camera_calib.calibration import Calibration, stack_views
 from camera_calib.freedom import Freedom, of_ports, pose_names
 from camera_calib.judge.judgement import judge, verdicts
 from camera_calib.judge.validation import halves_agreement
@@ -38,16 +38,9 @@ def test_the_parts_of_the_noise_and_the_covariance_are_those_of_dense_matrices()
     views = views_of(TRUTH, poses, 0.1, rng, points + bow)
     together = rng.normal(0.0, 0.1, (6, 2))
     lean = (points[:, :2] - points[:, :2].mean(axis=0)) / 0.15
-    views = [
-        TargetView(
-            name=view.name,
-            pixels={
-                name: pixels + together[v] * lean[:, :1] * lean[:, 1:]
-                for name, pixels in view.pixels.items()
-            },
-        )
-        for v, view in enumerate(views)
-    ]
+    for v, view in enumerate(views):
+        for pixels in view.pixels.values():
+            pixels += together[v] * lean[:, :1] * lean[:, 1:]
     views[1].pixels["left"][2:5] = np.nan
     del views[3].pixels["right"]  # type: ignore[attr-defined]
     freedom, shape = (
@@ -92,7 +85,6 @@ def test_places_of_corners_are_found_with_their_size_and_stated() -> None:
     sizes = []
     for seed in range(3):
         found = run_trial(seed, replace(TARGETS["correlated"], place_m=6e-5))
-        assert found.spread is not None
         sizes.append(found.spread.noise.place_sigmas_m[0])
         assert levels(found) == {"in": "look", "across": "good"}
     assert np.sqrt(np.mean(np.square(sizes))) == pytest.approx(6e-5, rel=0.25)
@@ -105,7 +97,6 @@ def test_places_of_corners_are_found_with_their_size_and_stated() -> None:
 def test_noise_is_no_uneven_print_and_a_bend_that_was_not_adjusted_lies_across_the_target() -> None:
     def places_m(seed: int, target: Board, *shape: TargetShape) -> tuple[float, float]:
         found = run_trial(seed, target, *shape).spread
-        assert found is not None
         return found.noise.place_sigmas_m
 
     for seed in range(3):
@@ -129,7 +120,6 @@ def test_a_few_bad_corners_are_found_with_their_size() -> None:
         pixels[bad] -= camera.project(pose.apply(points))
         views.append(replace(view, pixels={"camera": pixels}))
     found = recalibrate(sound, views)
-    assert found.spread is not None
     rms_m = 3e-4 * (len(bad) / len(sound.target_points) / 2.0) ** 0.5
     # Their weights in the adjustment are low, and so is what they count here.
     assert 0.5 * rms_m < found.spread.noise.place_sigmas_m[0] < rms_m
@@ -154,7 +144,6 @@ def test_halves_of_the_views_agree_by_their_covariances() -> None:
         agreement = halves_agreement((first, second))
         found.append(agreement.chi2 / agreement.parameters)
         assert 0.0 < agreement.p_value < 1.0
-        assert first.spread is not None
         noise = first.spread.noise
         alone.append(noise.together.sum() / (noise.alone + noise.together.sum()))
     # Chi-squared with 90 degrees of freedom: a sigma of 15 %.

@@ -94,7 +94,6 @@ def test_colmap_projects_as_we_do_from_what_it_reads(target: str, rig: Rig) -> N
         ours = camera.project(rig.cam_from_rig[name].apply(points))
         if i > 1:
             rigid = sensors.sensor_from_rig(theirs.sensor_id)
-            assert rigid is not None
             np.testing.assert_allclose(entry.cam_from_rig.matrix(), rigid.matrix(), atol=1e-14)
             points = points @ rigid.matrix()[:, :3].T + rigid.matrix()[:, 3]
         known = np.isfinite(ours[:, 0]) & (points[:, 2] > 0.1)  # COLMAP sees nothing behind it

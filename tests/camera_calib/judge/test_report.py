@@ -146,12 +146,9 @@ def test_a_picture_that_does_no_harm_asks_for_nothing() -> None:
 def test_the_working_range_follows_the_views() -> None:
     """A target measured in squares of its own has no metres: 2 would be inside of the camera."""
     assert judge(usual(), None).working_range_m == 2.0
-    found = usual()
-    pose = found.rig_from_target
-    huge = replace(
-        found,
-        rig_from_target=type(pose).from_components(30.0 * pose.translation, pose.rotation),
-    )
+    pose = usual().rig_from_target
+    away = type(pose).from_components(30.0 * pose.translation, pose.rotation)
+    huge = replace(usual(), rig_from_target=away)
     assert 20 < judge(huge, None).working_range_m < 60
 
 

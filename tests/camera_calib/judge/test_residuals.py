@@ -9,11 +9,10 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.artefacts import json_values
 from camera_calib.approximation.pinhole_warp import best_warp
-from camera_calib.calibration import Calibration, TargetView
+from camera_calib.calibration import TargetView
 from camera_calib.freedom import Freedom, intrinsics, of_cameras, pose_names
 from camera_calib.judge.judgement import judge, verdicts
 from camera_calib.judge.residuals import (
-    HomographyTest,
     camera_residuals,
     homography_residuals,
     homography_test,
@@ -37,12 +36,6 @@ from tests.oracles_report import (
 )
 
 CAMERA = DESIGN.cameras["left"]
-
-
-def homographies(calibration: Calibration, camera: str = "left") -> HomographyTest:
-    found = homography_test(calibration, camera)
-    assert found is not None
-    return found
 
 
 def test_the_angle_at_the_port_obeys_snell() -> None:
@@ -180,7 +173,7 @@ def test_residuals_are_those_of_opencvs_homography() -> None:
 def test_a_sound_calibration_leaves_noise_up_to_the_edge() -> None:
     found = usual()
     for name in found.rig.cameras:
-        test = homographies(found, name)
+        test = homography_test(found, name)
         assert test.views == len(found.views)
         assert test.inner_px == pytest.approx(0.1, rel=0.08)
         assert test.outer_px == pytest.approx(0.1, rel=0.2)
@@ -192,7 +185,7 @@ def test_a_forgotten_port_leaves_more_outwards() -> None:
     OPENCV's model can, and the missing centre is left (noise 0.03)."""
     made = synthetic_views(true_rig(), 12, 0.05, 1)
     bare = without_ports(true_rig())
-    test = homographies(
+    test = homography_test(
         adjusted(made.views, made.points, bare, Freedom(free=("right.rx_rad",))), "left"
     )
     assert test.excess_px > 0.2
@@ -202,7 +195,7 @@ def test_a_forgotten_port_leaves_more_outwards() -> None:
     free = Freedom(free=(*of_cameras(DESIGN, intrinsics("opencv5")), *pose_names(DESIGN)))
     fitted = adjusted(made.views, made.points, without_ports(DESIGN), free)
     for name in fitted.rig.cameras:
-        test = homographies(fitted, name)
+        test = homography_test(fitted, name)
         assert test.excess_px > 0.2 * test.inner_px
         assert test.outer_px > 0.036
     assert any("homograph" in v.text for v in verdicts(judge(fitted, None)) if v.level != "good")
@@ -214,7 +207,9 @@ def test_outliers_do_not_count() -> None:
     spoiled[np.nonzero(np.isfinite(spoiled[:, 0]))[0][::12]] += 20.0
     views = list(found.views)
     views[2] = TargetView(name="02", pixels={**views[2].pixels, "left": spoiled})
-    before, after = homographies(found), homographies(replace(found, views=tuple(views)))
+    before, after = (
+        homography_test(one, "left") for one in (found, replace(found, views=tuple(views)))
+    )
     assert after.inner_px == pytest.approx(before.inner_px, rel=0.02)
     assert after.inner_count + after.outer_count < before.inner_count + before.outer_count
 

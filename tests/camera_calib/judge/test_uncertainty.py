@@ -169,7 +169,6 @@ def test_a_length_fits_the_overlap() -> None:
 
 def test_the_baselines_sigma_is_that_of_its_length() -> None:
     rig = usual().rig
-    assert rig.covariance is not None
     draws = np.random.default_rng(3).multivariate_normal(
         np.zeros(len(rig.covariance.parameters)), rig.covariance.matrix, size=4000, method="eigh"
     )

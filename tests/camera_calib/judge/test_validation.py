@@ -154,14 +154,21 @@ def test_lengths_are_exact_in_the_true_rig() -> None:
     assert found.scale_ppm()[0] == pytest.approx(0.0, abs=600.0)  # the bias, expected of noise
 
 
-def test_lengths_err_as_their_noise() -> None:
-    found = lengths_of(usual())
+def test_lengths_err_as_their_noise_and_a_wrong_baseline_or_target_is_a_wrong_scale() -> None:
+    calibration = usual()
+    found = lengths_of(calibration)
     rms, expected = found.rms_m()
     assert rms / expected == pytest.approx(1.0, abs=0.2)
     scale, sigma = found.scale_ppm()
     assert abs(scale) < 4 * sigma
     scaled = (found.error_m - found.bias_m) / found.sigma_m
     assert np.std(scaled) == pytest.approx(1.0, abs=0.2)
+    longer = moved_rig(calibration.rig, {"right.x_m": -0.001 * 0.1001})
+    of_longer, sigma = lengths_of(replace(calibration, rig=longer)).scale_ppm()
+    assert of_longer - scale == pytest.approx(1000.0, abs=60.0)
+    assert sigma < 1000.0
+    wrong = lengths_of(replace(calibration, target_points=0.998 * calibration.target_points))
+    assert wrong.scale_ppm()[0] - scale == pytest.approx(2000.0, abs=60.0)
 
 
 def test_lengths_in_dull_pictures_err_as_their_noise() -> None:
@@ -179,17 +186,6 @@ def test_lengths_in_dull_pictures_err_as_their_noise() -> None:
     scores = (found.error_m - found.bias_m) / found.sigma_m
     for odd in (0, 1):
         assert np.std(scores[found.view % 2 == odd]) == pytest.approx(1.0, abs=0.1)
-
-
-def test_a_wrong_baseline_or_target_is_a_wrong_scale() -> None:
-    found = usual()
-    longer = moved_rig(found.rig, {"right.x_m": -0.001 * 0.1001})
-    scale, sigma = lengths_of(replace(found, rig=longer)).scale_ppm()
-    before, _ = lengths_of(found).scale_ppm()
-    assert scale - before == pytest.approx(1000.0, abs=60.0)
-    assert sigma < 1000.0
-    wrong = lengths_of(replace(found, target_points=0.998 * found.target_points))
-    assert wrong.scale_ppm()[0] - before == pytest.approx(2000.0, abs=60.0)
 
 
 def test_the_farthest_of_a_grid_are_its_corners() -> None:

@@ -77,10 +77,8 @@ def test_a_corner_behind_an_edge_is_refused() -> None:
     x, y = true[20].astype(int)
     hidden = picture.copy()
     hidden[y - 20 : y + 20, x - 20 : x + 1] = 90
-    near = true[20:21]
-
     states = [
-        int(fit_corners(shown, near, 20.0 * np.eye(2)[None]).states[0])
+        fit_corners(shown, true[20:21], 20.0 * np.eye(2)[None]).states[0]
         for shown in (picture, hidden)
     ]
 

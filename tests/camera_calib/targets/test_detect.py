@@ -146,10 +146,8 @@ def test_a_board_of_another_size_is_refused_and_its_size_said() -> None:
 
 def test_wrong_layouts_of_markers_are_refused() -> None:
     _, picture, _ = view(KINDS[1])
-    legacy = parse_target(KINDS[1] + " legacy")
-    other = parse_target("charuco 8x6 40mm 30mm DICT_6X6_50")
-    for wrong in (legacy, other):
-        assert detect(wrong, picture).refused
+    for wrong in (f"{KINDS[1]} legacy", "charuco 8x6 40mm 30mm DICT_6X6_50"):
+        assert detect(parse_target(wrong), picture).refused
 
 
 RNG = np.random.default_rng(0)
