@@ -7,19 +7,24 @@ its JSON; warm, of one core, the median of some with another setting each. The w
 certifies on the fine grid, and writes maps, page and missions for vehicles. Two areas: that of the
 template that the tutorial starts from, and a strip of 10,000 swaths. Tiles are of a mosaic as the
 program writes it, cloud-optimised, from all of its levels, none asked for twice; the twin reads the
-same pixels with rasterio and encodes them alike, and does nothing else. Ends with exit code 1 when
+same pixels with rasterio and encodes them alike, and does nothing else. Then a studio of its own is
+put under load. Ends with exit code 1 when
 a goal is missed.
 """
 
 import argparse
+import math
+import select
+import socket
+import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import rasterio
 from pydantic_core import to_json
 from rasterio.shutil import copy
@@ -30,76 +35,19 @@ from alice_survey.app.pipeline import template_text
 from alice_survey.app.report.rasters import encode_webp
 from alice_survey.app.studio.files import Workspace
 from alice_survey.app.studio.layers import Layers
-from alice_survey.core.config import SurveyConfig
 from alice_survey.core.errors import collected_by
 from alice_survey.core.executor import SERIAL
 from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
 from benchmarks.machine import heading, machine
-from missions.plan.preview import Draft, draft_settings, preview
+from missions.plan.preview import draft_settings, preview
 from missions.plan.run import run_plan
 
-_GOALS_S = {"tutorial": 0.5, "10,000 swaths": 2.0}
-_SPACING_M = 0.25
-_SWATH_M = 6.0
 _ALTITUDES_M = (0.8, 0.82, 0.81, 0.805, 0.815)
 """Of re-plans over the strip; over the tutorial's area 2.5 times as high."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Replan:
-    """How long an area takes to plan."""
-
-    area: str
-    swaths: int
-    stations: int
-    cpu_s: float
-    """Of a re-plan: draft, plan and JSON."""
-    first_s: float
-    """The same, of the first, cold."""
-    megabytes: float
-    """Of its JSON."""
-    whole_s: float
-    """Of the stage `plan`."""
-
-    def figures(self) -> list[Figure]:
-        """Computing of a re-plan, next to the whole stage."""
-        maximum = _GOALS_S.get(self.area)
-        goal = None if maximum is None else Goal(maximum=maximum)
-        return [
-            Figure(name=f"{self.area}: re-plan", value=self.cpu_s, unit="s", goal=goal),
-            Figure(
-                name=f"{self.area}: re-plan over a whole plan", value=self.cpu_s, unit="s",
-                peer="stage plan", peer_value=self.whole_s, goal=Goal(maximum=0.5, of="ratio"),
-            ),
-        ]  # fmt: skip
-
-
-@dataclass(frozen=True, kw_only=True)
-class Tiles:
-    """How long tiles of a mosaic take."""
-
-    megapixels: float
-    tiles: int
-    cpu_ms: float
-    """Of a tile, mean over all levels."""
-    worst_ms: float
-    twin_ms: float
-    """Of reading and encoding its pixels alone."""
-
-    def figures(self) -> list[Figure]:
-        """Computing of a tile, next to its twin."""
-        return [
-            Figure(name="tile of a mosaic", value=self.cpu_ms, unit="ms", goal=Goal(maximum=60.0)),
-            Figure(
-                name="tile of a mosaic over reading and encoding it", value=self.cpu_ms, unit="ms",
-                peer="rasterio and OpenCV", peer_value=self.twin_ms,
-                goal=Goal(maximum=1.5, of="ratio"),
-            ),
-        ]  # fmt: skip
-
-
-def tiles_of(side_px: int, number: int = 60) -> Tiles:
-    """Ask for tiles of a mosaic of texture, spread over its levels and places."""
+def tile_figures(side_px: int, number: int = 60) -> list[Figure]:
+    """Computing of tiles of a mosaic of texture, spread over its levels and places."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "mosaic" / "mosaic.tif"
         path.parent.mkdir()
@@ -122,13 +70,14 @@ def tiles_of(side_px: int, number: int = 60) -> Tiles:
             began = time.process_time()
             _twin(path, about.levels - 1 - level, x, y, about.tile_px)
             twins_ms.append(1e3 * (time.process_time() - began))
-    return Tiles(
-        megapixels=side_px**2 / 1e6,
-        tiles=len(times_ms),
-        cpu_ms=float(np.mean(times_ms)),
-        worst_ms=float(np.max(times_ms)),
-        twin_ms=float(np.mean(twins_ms)),
-    )
+    own_ms, twin_ms = float(np.mean(times_ms)), float(np.mean(twins_ms))
+    return [
+        Figure(name="tile of a mosaic", value=own_ms, unit="ms", goal=Goal(maximum=60.0)),
+        Figure(
+            name="tile of a mosaic over reading and encoding it", value=own_ms, unit="ms",
+            peer="rasterio and OpenCV", peer_value=twin_ms, goal=Goal(maximum=1.5, of="ratio"),
+        ),
+    ]  # fmt: skip
 
 
 def _write_mosaic(path: Path, side_px: int) -> None:
@@ -160,64 +109,103 @@ def _twin(path: Path, halvings: int, x: int, y: int, tile_px: int) -> bytes:
 
 def main() -> None:
     """Measure, print, and say which goals are missed."""
-    options = _options()
+    parser = argparse.ArgumentParser(description="Benchmark of the studio.")
+    add_options(parser, quick="a strip of 1,000 swaths, and a tenth of the load")
+    options = parser.parse_args()
     about = machine(("numpy", "numba", "shapely", "tomlkit", "rasterio"))
     print(heading(about), "\n", flush=True)
     swaths = 1_000 if options.quick else 10_000
-    rows = [replanned("tutorial", {}, 2.5), replanned(f"{swaths:,} swaths", _strip(swaths), 1.0)]
-    tiles = tiles_of(4_096 if options.quick else 16_384)
-    figures = (*(figure for row in rows for figure in row.figures()), *tiles.figures())
-    values = {"replans": [asdict(row) for row in rows], "tiles": asdict(tiles)}
-    sys.exit(hand_over(options, about, Findings(figures=figures), values))
+    figures = [
+        *replan_figures("tutorial", {}, 2.5),
+        *replan_figures(f"{swaths:,} swaths", _strip(swaths), 1.0),
+        *tile_figures(4_096 if options.quick else 16_384),
+        *load_figures(10 if options.quick else 1),
+    ]
+    sys.exit(hand_over(options, about, Findings(figures=tuple(figures)), {}))
 
 
 def _strip(swaths: int) -> dict[str, dict[str, Any]]:
     """Settings of a strip that lines cross, as many as are wanted."""
-    return {
-        "area": {"length_m": swaths * _SPACING_M - 0.01, "width_m": _SWATH_M},
-        "plan": {"line_spacing_m": _SPACING_M, "line_heading_deg": 90.0, "speed_mps": 0.1,
-                 "relief_m": 0.05},
-        "camera": {"focal_mm": 8.0},
-    }  # fmt: skip
+    plan = {"line_spacing_m": 0.25, "line_heading_deg": 90.0, "speed_mps": 0.1, "relief_m": 0.05}
+    area = {"length_m": swaths * 0.25 - 0.01, "width_m": 6.0}
+    return {"area": area, "plan": plan, "camera": {"focal_mm": 8.0}}
 
 
-def replanned(name: str, settings: dict[str, dict[str, Any]], scale: float) -> Replan:
+def replan_figures(area: str, settings: dict[str, dict[str, Any]], scale: float) -> list[Figure]:
     """Plan an area again and again as the studio does, and once as the command line does."""
     text = draft_settings(template_text(), Path("survey.toml"), settings).text
-    times_s, draft, size = [], None, 0
+    times_s = []
     for altitude_m in (_ALTITUDES_M[0], *_ALTITUDES_M):
         began = time.process_time()
-        changes = {"plan": {"altitude_m": scale * altitude_m}}
-        draft = draft_settings(text, Path("survey.toml"), changes)
+        draft = draft_settings(
+            text, Path("survey.toml"), {"plan": {"altitude_m": scale * altitude_m}}
+        )
         found = preview(draft.config)
-        size = len(to_json(found, inf_nan_mode="null"))
+        to_json(found, inf_nan_mode="null")
         times_s.append(time.process_time() - began)
         if not found["ok"]:
             raise RuntimeError(found["error"])
-    assert isinstance(draft, Draft)
-    return Replan(
-        area=name,
-        swaths=sum(line["kind"] == "survey" for line in found["lines"]),
-        stations=found["totals"]["stations"],
-        cpu_s=float(np.median(times_s[1:])),
-        first_s=times_s[0],
-        megabytes=size / 1e6,
-        whole_s=_whole_s(draft.config),
-    )
-
-
-def _whole_s(config: SurveyConfig) -> float:
-    """Computing of the stage `plan`."""
     with tempfile.TemporaryDirectory() as folder, collected_by(lambda _, __: None):
         began = time.process_time()
-        run_plan(Path(folder), Path(folder), SERIAL, survey=config)
-        return time.process_time() - began
+        run_plan(Path(folder), Path(folder), SERIAL, survey=draft.config)
+        whole_s = time.process_time() - began
+    cpu_s = float(np.median(times_s[1:]))
+    maximum = {"tutorial": 0.5, "10,000 swaths": 2.0}.get(area, math.inf)
+    return [
+        Figure(name=f"{area}: re-plan", value=cpu_s, unit="s", goal=Goal(maximum=maximum)),
+        Figure(
+            name=f"{area}: re-plan over a whole plan", value=cpu_s, unit="s", peer="stage plan",
+            peer_value=whole_s, goal=Goal(maximum=0.5, of="ratio"),
+        ),
+    ]  # fmt: skip
 
 
-def _options() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description="Benchmark of the studio.")
-    add_options(parser, quick="a strip of 1,000 swaths")
-    return parser.parse_args()
+def load_figures(part: int) -> list[Figure]:
+    """A studio under load: what it holds afterwards, and how long others wait meanwhile.
+
+    2,000 reads that are broken off, 300 clients that send a request byte by byte and never end it,
+    200 that listen for events, and 60 previews of 300 x 300 m, or a part of them.
+    """
+    with tempfile.TemporaryDirectory() as temporary:
+        (big := Path(temporary) / "dense" / "big.bin").parent.mkdir()
+        big.write_bytes(bytes(8 << 20))
+        command = [sys.executable, "-m", "alice_survey", "studio", "-w", temporary, "--no-browser"]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as studio:
+            address, token = str(studio.stdout and studio.stdout.readline()).split()[4].split("?")
+            port, cookie = int(address.split(":")[2].strip("/")), f"X-Studio-Token: {token[6:]}"
+            process, waits_s, opened = psutil.Process(studio.pid), [], list[socket.socket]()
+
+            def ask(path: str, body: str = "", end: str = "\r\n\r\n") -> socket.socket:
+                kind = f"Content-Type: application/json\r\nContent-Length: {len(body)}\r\n"
+                text = f"{'POST' if body else 'GET'} {path} HTTP/1.1\r\nHost: localhost\r\n"
+                one = socket.create_connection(("127.0.0.1", port), timeout=120)
+                one.sendall(f"{text}{kind * bool(body)}{cookie}{end}{body}".encode())
+                return one
+
+            preview_of = '{"changes": {"area": {"length_m": 300, "width_m": 300}}}'
+            ask("/api/plan/preview", preview_of).recv(12)  # compiled and loaded
+            time.sleep(5.0)
+            files, resident = process.num_fds(), process.memory_info().rss
+            for _ in range(2_000 // part):
+                ask("/files/dense/big.bin").recv(1000)
+            opened += [ask("/api/events", end="") for _ in range(300 // part)]
+            opened += [ask("/api/events") for _ in range(200 // part)]
+            opened += [ask("/api/plan/preview", preview_of) for _ in range(60 // part)]
+            while opened:
+                began_s = time.monotonic()
+                ask("/app/core.js").recv(12)
+                waits_s.append(time.monotonic() - began_s)
+                time.sleep(0.25)
+                opened = [one for one in opened if not select.select([one], [], [], 0)[0]]
+            time.sleep(15.0)
+            resident -= process.memory_info().rss
+            found = (
+                ("open files after the load, more than before", process.num_fds() - files, "", 2.0),
+                ("memory after the load, more than before", -resident / 2**20, "MiB", 200.0),
+                ("longest wait for a static file", max(waits_s), "s", 5.0),
+            )
+            studio.terminate()
+    return [Figure(name=n, value=v, unit=u, goal=Goal(maximum=most)) for n, v, u, most in found]
 
 
 if __name__ == "__main__":

@@ -217,13 +217,13 @@ class BusyError(AliceError):
 class JobRecord(JsonRecord):
     """`job.json` of a job: a command that the studio has started."""
 
-    number: int = Field(ge=1)
+    number: int = Field(ge=1, lt=10**9)
     name: str
     title: str
     command: str
     """As a terminal takes it."""
     started_utc: str
-    process: int = Field(ge=1)
+    process: int = Field(ge=1, lt=1 << 31)
     created_s: float
     """When the process began, as the system counts: tells it from another of the same number."""
     ended_utc: str | None = None

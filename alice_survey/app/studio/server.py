@@ -138,7 +138,10 @@ def application(studio: Studio, port: int) -> Starlette:
                 is_known=lambda request: (
                     _is_token(studio, request.cookies.get(cookie))
                     or _is_token(studio, request.headers.get(_TOKEN))
-                    or _is_token(studio, request.query_params.get("token"))
+                    or (
+                        request.url.path.startswith("/files/")  # as a GIS asks
+                        and _is_token(studio, request.query_params.get("token"))
+                    )
                 ),
             ),
             Middleware(TrustedHostMiddleware, allowed_hosts=HOSTS, www_redirect=False),
@@ -209,8 +212,7 @@ class _ComputeQueue:
             if not has_turn:
                 return _fault(503, "the studio computes for other pages: try again in a moment")
             found = await run_in_threadpool(work)
-            if not self._waiting:
-                release_memory()
+            await run_in_threadpool(release_memory)
             return found
         finally:
             if has_turn:

@@ -55,7 +55,7 @@ class AskedMeasure(Config):
 
     kind: Literal["line", "points", "polygon"]
     places: list[tuple[Coordinate, ...]] = Field(min_length=2, max_length=_MAX_PLACES)
-    base: float | Literal["rim"] | None = None
+    base: Coordinate | Literal["rim"] | None = None
     """Plane of a polygon's volume."""
 
 
@@ -76,7 +76,7 @@ class ExportedMeasure(Config):
 
     name: str = Field(max_length=200)
     kind: Literal["line", "points", "polygon"]
-    places: list[tuple[float, ...]] = Field(min_length=1, max_length=_MAX_PLACES)
+    places: list[tuple[Coordinate, ...]] = Field(min_length=1, max_length=_MAX_PLACES)
     figures: list[ExportedFigure] = Field(max_length=100)
     notes: list[str] = Field(default=[], max_length=20)
 

@@ -161,8 +161,9 @@ def test_every_page_hears_an_event(server: Server) -> None:
 
 
 def events_asked(server: Server) -> bytes:
-    path = f"/api/events?token={server.studio.token}"
-    return f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\n\r\n".encode()
+    lines = ("GET /api/events HTTP/1.1", f"Host: 127.0.0.1:{server.port}",
+             f"X-Studio-Token: {server.studio.token}", "", "")  # fmt: skip
+    return "\r\n".join(lines).encode()
 
 
 def read_to(page: socket.socket, text: bytes) -> bytes:

@@ -56,8 +56,9 @@ def max_mib(process: int) -> float:
     return int(found.group(1)) / 1024
 
 
-def loaded(address: str) -> bytes:
-    with urllib.request.urlopen(address, timeout=60) as answer:  # noqa: S310
+def loaded(address: str, token: str) -> bytes:
+    asked = urllib.request.Request(address, headers={"X-Studio-Token": token})  # noqa: S310
+    with urllib.request.urlopen(asked, timeout=60) as answer:  # noqa: S310
         content: bytes = answer.read()
     return content
 
@@ -76,20 +77,20 @@ def test_a_large_raster_in_little_memory_until_ctrl_c(tmp_path: Path) -> None:
     try:
         assert started.stdout is not None
         line = started.stdout.readline()
-        url = line.split(" is shown at ")[1].split("?")[0]
+        url, token = line.split(" is shown at ")[1].split()[0].split("?token=")
         assert url.startswith(f"http://{ADDRESS}:")
-        loaded(f"{url}tiles/sigma/0/0/0.webp")  # what it needs anyway is loaded
+        loaded(f"{url}tiles/sigma/0/0/0.webp", token)  # what it needs anyway is loaded
         before = max_mib(started.pid)
         for spot, expected in {
             "dem/6/1/0": 0, "dem/6/0/0": 512**2, "dem/6/37/37": 512**2,
             "dem/5/10/10": 256**2, "dem/3/2/2": 64**2, "dem/1/0/0": 2 * 16**2,
             "dem/0/0/0": 3 * 8**2, "mosaic/6/20/20": 512**2, "mosaic/4/5/5": 128**2,
         }.items():  # fmt: skip
-            with Image.open(io.BytesIO(loaded(f"{url}tiles/{spot}.webp"))) as tile:
+            with Image.open(io.BytesIO(loaded(f"{url}tiles/{spot}.webp", token))) as tile:
                 opaque = np.asarray(tile.convert("RGBA"))[..., 3] == 255
             # A level covers the whole raster, so that coarse pixels are not quite 2**h wide.
             assert (spot, opaque.sum()) == (spot, pytest.approx(expected, rel=0.3))
-        assert b"/tiles/dem/{}.webp" in loaded(f"{url}api/map")
+        assert b"/tiles/dem/{}.webp" in loaded(f"{url}api/map", token)
         grown = max_mib(started.pid) - before
         started.send_signal(signal.SIGINT)
         out, shown = started.communicate(timeout=20)
