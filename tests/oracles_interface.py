@@ -4,15 +4,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey.core.frames import Array
 from camera_calib.camera import Camera
 from camera_calib.triangulate import Triangulation, reproject, triangulate
 from tests.cameras import changed, flat_port_camera
-
-Array = NDArray[np.float64]
 
 LENS = flat_port_camera(
     width_px=2704,

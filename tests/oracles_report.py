@@ -6,11 +6,11 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.config import CameraConfig, WaterConfig
+from alice_survey.core.frames import Array
 from camera_calib.calibrate.adjust import adjust
 from camera_calib.calibrate.start import locate
 from camera_calib.calibration import Calibration, TargetView
@@ -19,8 +19,6 @@ from camera_calib.freedom import POSE, Freedom, intrinsics, of_cameras, pose_nam
 from camera_calib.judge.validation import HeldOut, hold_out
 from camera_calib.ports.flat import FlatPort
 from camera_calib.rig import Covariance, Rig, design_rig
-
-Array = NDArray[np.float64]
 
 DESIGN = design_rig(CameraConfig(port_distance_m=0.05), WaterConfig(), scale=4)
 SQUARE_M = 0.03

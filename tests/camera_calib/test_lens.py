@@ -100,10 +100,3 @@ def test_a_rational_lens_ends_at_its_pole() -> None:
     assert fold(k) == pytest.approx(2.0, rel=1e-12)
     u, v = undistort(*distort(1.3, 0.1, k), k, fold(k))
     np.testing.assert_allclose((u, v), (1.3, 0.1), atol=1e-12)
-
-
-def test_beyond_the_farthest_image_there_is_no_ray() -> None:
-    k = vector(k1=-0.3)
-    farthest = math.sqrt(1 / 0.9) * (1 - 0.3 / 0.9)
-    assert np.isfinite(undistort(0.999 * farthest, 0.0, k, fold(k))).all()
-    assert np.isnan(undistort(1.001 * farthest, 0.0, k, fold(k))).all()

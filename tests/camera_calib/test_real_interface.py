@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey.core.frames import Array
 from camera_calib.camera import Camera
 from camera_calib.lenses.opencv import COEFFICIENTS
 from camera_calib.targets.detect import detect
@@ -22,7 +23,6 @@ from camera_calib.triangulate import Triangulation
 from tests.cameras import changed, flat_port_camera
 from tests.oracles_interface import Tank, behind_interface
 
-Array = NDArray[np.float64]
 PUBLISHED_MEDIAN_PX = 4.65
 """Of the sum of both cameras' errors: 2.13 + 2.49 px."""
 N_WATER = 1.333

@@ -1,7 +1,6 @@
 """OpenCV's own loader and projection agree with what is written, and its samples are read."""
 
 import tempfile
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -77,14 +76,6 @@ def test_opencv_projects_as_we_do_from_what_its_loader_reads(suffix: str, rig: R
         seen = opencv_pixels(POINTS_RIG, rvec, tvec, read[m], read[d])
         ours = camera.project(rig.cam_from_rig[name].apply(POINTS_RIG))
         assert_same_pixels(ours, seen + 0.5)
-
-
-def test_the_half_pixel_is_taken_once(tmp_path: Path) -> None:
-    write_opencv(tmp_path / "a.yml", replace(STEREO, cameras={"left": AIR}, cam_from_rig={
-        "left": RigidTransform.identity()}))  # fmt: skip
-    storage = cv2.FileStorage(str(tmp_path / "a.yml"), cv2.FILE_STORAGE_READ)
-    matrix = storage.getNode("camera_matrix").mat()
-    np.testing.assert_array_equal(matrix[:2, 2], [319.75, 240.5])
 
 
 def test_opencvs_sample_calibration_of_one_camera_is_read(shared_data: Path) -> None:

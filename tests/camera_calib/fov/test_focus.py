@@ -149,14 +149,6 @@ def test_the_port_bends_the_field_so_that_no_altitude_is_sharp_everywhere() -> N
     assert softer.frame_near_altitude_m < 1.0 < softer.frame_far_altitude_m
 
 
-def test_the_hyperfocal_distance_is_the_nearest_that_reaches_infinity() -> None:
-    at = LENS.hyperfocal_m(1.0)
-    assert math.isinf(replace(LENS, focus_m=at * 1.001).sharp_depths_m(1.0)[1])
-    near, far = replace(LENS, focus_m=at * 0.999).sharp_depths_m(1.0)
-    assert math.isfinite(far)
-    assert near == pytest.approx(at / 2, rel=0.01)
-
-
 def test_traced_rays_at_the_limits_blur_by_the_circle_of_confusion() -> None:
     row = fov_table([12.5], [2.0], 1.34, PORT, 2.0)[0]
     lens = replace(LENS, focus_m=row.focus_air_m)

@@ -129,8 +129,5 @@ def test_contrast_shows_the_colours(turn: int) -> None:
 
 
 def test_linear_light_inverts_the_srgb_curve() -> None:
-    light = linear_light(np.arange(256, dtype=np.uint8))
-    assert light[0] == 0
-    assert light[255] == pytest.approx(1)
-    assert light[188] == pytest.approx(0.5, abs=0.005)
-    assert np.all(np.diff(light) > 0)
+    values = np.arange(256, dtype=np.uint8)
+    np.testing.assert_array_equal(to_srgb(linear_light(values)), values)

@@ -151,7 +151,9 @@ def test_wrong_layouts_of_markers_are_refused() -> None:
 
 
 RNG = np.random.default_rng(0)
+TEXTURE = cv2.GaussianBlur(RNG.normal(0, 1, (300, 400)), (0, 0), 4)
 NO_TARGET = {
+    "texture": cv2.normalize(TEXTURE, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8),
     "blank": np.full((150, 200), 130, np.uint8),
     "dark": RNG.integers(0, 4, (150, 200), dtype=np.uint8),
     "noise": RNG.integers(0, 256, (150, 200), dtype=np.uint8),
@@ -165,7 +167,7 @@ NO_TARGET = {
 def test_pictures_without_the_target_are_refused_with_a_reason(text: str, name: str) -> None:
     picture = NO_TARGET[name]
     found = detect(parse_target(text), picture)
-    assert found.pixels is None
+    assert found.pixels is None and chessboard_size(picture) is None
     (rejection,) = found.rejections("07", "left")
     assert (rejection.view, rejection.camera, rejection.points) == ("07", "left", 0)
     assert rejection.reason

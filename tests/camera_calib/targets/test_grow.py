@@ -87,35 +87,6 @@ def test_a_faint_board_in_noise_is_found() -> None:
     assert found_in(light, true_pixels(BOARD, seen), 1.5) >= 50
 
 
-def test_hidden_corners_are_left_out() -> None:
-    picture, true = view((30, 25, 20))
-    for spot in (true[20], true[49]):
-        x, y = spot.astype(int)
-        cv2.circle(picture, (int(x), int(y)), 25, 170, -1)
-    found = grown_chessboard(picture, (6, 9))
-    assert found is not None
-    seen = matched(found, true, 0.4)
-    assert 44 <= len(seen) <= 52
-    assert not {20, 49} & seen
-
-
-def test_the_part_that_shows_is_counted_but_not_taken_for_the_board() -> None:
-    picture, true = view((0, 0, 0))
-    picture[:, : int((true[0, 0] + true[1, 0]) / 2)] = 90
-    assert grown_chessboard(picture, (6, 9)) is None
-    assert chessboard_size(picture) == (8, 6)
-
-
-def test_there_is_no_board_in_noise_or_texture() -> None:
-    rng = np.random.default_rng(4)
-    noise = rng.integers(0, 256, (300, 400)).astype(np.uint8)
-    texture = cv2.GaussianBlur(noise.astype(np.float32), (0, 0), 4)
-    stretched = cv2.normalize(texture, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
-    for picture in (noise, stretched, np.full((50, 50), 7, np.uint8)):
-        assert chessboard_size(picture) is None
-        assert grown_chessboard(picture, (4, 4)) is None
-
-
 def test_a_board_ends_where_its_outer_rows_are_seen() -> None:
     seen = np.ones((6, 9), dtype=bool)
     assert spans_board(seen)

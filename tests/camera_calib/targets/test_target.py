@@ -70,25 +70,12 @@ def test_any_chessboard_comes_back_from_its_words(
 @pytest.mark.parametrize(
     "text",
     [
-        "",
-        "circles 9x6 25mm",
-        "chessboard 9x6",
-        "chessboard 9 25mm",
-        "chessboard 9x6 25",
-        "chessboard 9x2 25mm",
-        "chessboard 900x6 25mm",
-        "chessboard 9x6 0mm",
-        "chessboard 9x6 25m",
-        "charuco 12x9 40mm 40mm",
-        "charuco 12x9 40mm 4mm",
-        "charuco 12x9 40mm 30mm DICT_9X9_50",
-        "charuco 12x9 40mm 30mm DICT_4X4_50",
-        "charuco 12x9 40mm 30mm DICT_4X4_100 old",
-        "apriltag 6x6 88mm",
-        "apriltag 6x6 88mm 26.4mm",
-        "apriltag 6x6 88mm 26",
-        "apriltag 6x6 88mm nan",
-        "apriltag 30x30 88mm 0.3",
+        *("", "circles 9x6 25mm", "apriltag 30x30 88mm 0.3"),
+        *(f"chessboard {size} 25mm" for size in ("9", "9x2", "900x6")),
+        *(f"chessboard 9x6{side}" for side in ("", " 25", " 0mm", " 25m")),
+        *(f"charuco 12x9 40mm {marker}" for marker in ("40mm", "4mm")),
+        *(f"charuco 12x9 40mm 30mm DICT_{name}" for name in ("9X9_50", "4X4_50", "4X4_100 old")),
+        *(f"apriltag 6x6 88mm{gap}" for gap in ("", " 26.4mm", " 26", " nan")),
     ],
 )
 def test_wrong_words_give_one_clear_line(text: str) -> None:
@@ -100,20 +87,14 @@ def test_wrong_words_give_one_clear_line(text: str) -> None:
 @pytest.mark.parametrize(
     "change",
     [
-        {"format": "something"},
-        {"version": 2},
-        {"columns": "9"},
-        {"columns": True},
-        {"size_m": None},
-        {"shape": "round"},
-        {"kind": "circles"},
-        {"spacing": 0.3},
-        {"marker_m": 0.01},
+        *(("format", "something"), ("version", 2), ("columns", "9"), ("columns", True)),
+        *(("size_m", None), ("shape", "round"), ("kind", "circles")),
+        *(("spacing", 0.3), ("marker_m", 0.01)),
     ],
 )
-def test_wrong_files_give_one_clear_line(change: dict[str, object], tmp_path: Path) -> None:
+def test_wrong_files_give_one_clear_line(change: tuple[str, object], tmp_path: Path) -> None:
     path = tmp_path / "target.json"
-    path.write_text(json.dumps(parse_target("chessboard 9x6 25mm").to_json() | change))
+    path.write_text(json.dumps(parse_target("chessboard 9x6 25mm").to_json() | dict([change])))
     with pytest.raises(CalibrationError, match=r"target\.json") as caught:
         parse_target(str(path))
     assert "\n" not in str(caught.value)
