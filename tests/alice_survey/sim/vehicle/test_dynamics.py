@@ -25,44 +25,24 @@ ATTITUDES = st.tuples(st.floats(-3.1, 3.1), st.floats(-1.4, 1.4), st.floats(-3.1
 @settings(deadline=None)
 @given(nu=VELOCITIES)
 @pytest.mark.parametrize("coefficients", SETS)
-def test_both_coriolis_matrices_are_skew_and_do_no_work(coefficients: str, nu: Array) -> None:
+def test_kernels_and_matrices_match_the_textbook(coefficients: str, nu: Array) -> None:
+    """Coriolis matrices are skew and do no work; damping is the sum of its terms by names."""
     vehicle = m.alice(coefficients)
-    for mass in (vehicle.rigid_body.mass_matrix, vehicle.coefficients.added_mass):
-        matrix = dynamics.coriolis_matrix(mass, nu)
+    body, turned, damped = vehicle.plant.body, np.zeros(6), np.zeros(6)
+    dynamics.add_coriolis(body, nu, turned)
+    dynamics.add_damping(body, nu, damped)
+    masses = (vehicle.rigid_body.mass_matrix, vehicle.coefficients.added_mass, vehicle.mass)
+    rigid, added, _ = matrices = [dynamics.coriolis_matrix(mass, nu) for mass in masses]
+    for mass, matrix, force in zip(masses, matrices, (rigid @ nu, added @ nu, turned), strict=True):
         np.testing.assert_allclose(matrix, -matrix.T, atol=1e-12)
-        scale = 1.0 + np.abs(mass).max() * np.linalg.norm(nu) ** 3
-        assert abs(nu @ matrix @ nu) < 1e-12 * scale
-    force = np.zeros(6)
-    dynamics.add_coriolis(vehicle.plant.body, nu, force)
-    assert abs(nu @ force) < 1e-12 * (1.0 + np.abs(vehicle.mass).max() * np.linalg.norm(nu) ** 3)
-
-
-@settings(deadline=None)
-@given(nu=VELOCITIES)
-def test_coriolis_kernel_and_matrices_match_the_textbook(nu: Array) -> None:
-    vehicle = m.alice()
-    force = np.zeros(6)
-    dynamics.add_coriolis(vehicle.plant.body, nu, force)
-
-    rigid, added = vehicle.rigid_body.mass_matrix, vehicle.coefficients.added_mass
+        assert abs(nu @ force) < 1e-12 * (1.0 + np.abs(mass).max() * np.linalg.norm(nu) ** 3)
     textbook = sum(part.coriolis(nu) @ nu for part in oracle.parts(vehicle))
     textbook = textbook + oracle.added_coriolis(oracle.added_mass(vehicle), nu) @ nu
-    matrices = (dynamics.coriolis_matrix(rigid, nu) + dynamics.coriolis_matrix(added, nu)) @ nu
-
-    np.testing.assert_allclose(-force, textbook, atol=1e-9)
-    np.testing.assert_allclose(matrices, textbook, atol=1e-9)
-
-
-@settings(deadline=None)
-@given(nu=VELOCITIES)
-@pytest.mark.parametrize("coefficients", SETS)
-def test_damping_kernel_and_matrix_match_the_sum_by_names(coefficients: str, nu: Array) -> None:
-    vehicle = m.alice(coefficients)
-    force = np.zeros(6)
-    dynamics.add_damping(vehicle.plant.body, nu, force)
+    np.testing.assert_allclose(-turned, textbook, atol=1e-9)
+    np.testing.assert_allclose((rigid + added) @ nu, textbook, atol=1e-9)
     by_names = oracle.damping_force(vehicle, nu)
-    np.testing.assert_allclose(force, by_names, atol=1e-10)
-    np.testing.assert_allclose(-m.damping_matrix(vehicle.plant.body, nu) @ nu, by_names, atol=1e-10)
+    np.testing.assert_allclose(damped, by_names, atol=1e-10)
+    np.testing.assert_allclose(-m.damping_matrix(body, nu) @ nu, by_names, atol=1e-10)
 
 
 @pytest.mark.parametrize("coefficients", SETS)
@@ -102,35 +82,20 @@ def test_energy_falls_by_what_damping_takes(
 
 @settings(deadline=None)
 @given(
-    nu=VELOCITIES,
-    attitude=ATTITUDES,
-    speeds=arrays(np.float64, 5, elements=st.floats(-40.0, 40.0)).map(lambda n: np.round(n, 6)),
-    command=arrays(np.float64, 5, elements=st.floats(-90.0, 90.0)),
-    load=arrays(np.float64, 6, elements=st.floats(-10.0, 10.0)),
-    net_kg=st.floats(-2.0, 2.0),
+    draw=arrays(np.float64, 27, elements=st.floats(-1.0, 1.0)),
     cg=st.tuples(*[st.floats(-0.05, 0.05)] * 3),
     cg_inside=st.tuples(*[st.floats(-0.1, 0.1)] * 3),
-    time_s=st.floats(0.0, 60.0),
 )
 def test_rates_match_newtons_law_over_ground(
-    nu: Array,
-    attitude: tuple[float, float, float],
-    speeds: Array,
-    command: Array,
-    load: Array,
-    net_kg: float,
-    cg: tuple[float, float, float],
-    cg_inside: tuple[float, float, float],
-    time_s: float,
+    draw: Array, cg: tuple[float, float, float], cg_inside: tuple[float, float, float]
 ) -> None:
     """In a current that changes with depth and time, against an independent derivation."""
+    nu, load, attitude = 3.0 * draw[:6], 10.0 * draw[6:12], (*(draw[12:15] * [3.1, 1.4, 3.1]),)
+    speeds, command = np.round(40.0 * draw[15:20], 6), 90.0 * draw[20:25]
+    net_kg, time_s = 2.0 * draw[25], 30.0 + 30.0 * draw[26]
     plain = m.alice()
-    rigid = replace(
-        plain.rigid_body,
-        dry_kg=plain.rigid_body.dry_kg + net_kg,
-        cg_body_m=cg,
-        entrained_cg_body_m=cg_inside,
-    )
+    dry_kg = plain.rigid_body.dry_kg + net_kg
+    rigid = replace(plain.rigid_body, dry_kg=dry_kg, cg_body_m=cg, entrained_cg_body_m=cg_inside)
     vehicle = replace(plain, rigid_body=rigid)
     position = (1.0, -2.0, 7.0)
     state = m.state_of(vehicle, nu, attitude, position, speeds)
@@ -221,13 +186,11 @@ def test_restoring_moments_by_hand() -> None:
         inertia = low.rigid_body.inertia_kg_m2[axis]
         rate = m.rates(low, m.state_of(low, attitude_rad=attitude))
         assert rate[m.K + axis] == pytest.approx(-moment / inertia, rel=1e-9)
-
-
-def test_heavier_nose_pitches_down_and_heavier_starboard_rolls_to_it() -> None:
-    nose, starboard = m.block(cg=(0.02, 0.0, 0.0)), m.block(cg=(0.0, 0.02, 0.0))
-    moment = 50.0 * GRAVITY * 0.02
-    assert m.rates(nose, m.state_of(nose))[m.M] == pytest.approx(-moment / 6.0, rel=1e-9)
-    assert m.rates(starboard, m.state_of(starboard))[m.K] == pytest.approx(moment / 1.0, rel=1e-9)
+    # A heavier nose pitches down, a heavier starboard side rolls to it.
+    for cg, axis, expected in (((0.02, 0.0, 0.0), m.M, -1 / 6.0), ((0.0, 0.02, 0.0), m.K, 1.0)):
+        off = m.block(cg=cg)
+        rate = m.rates(off, m.state_of(off))
+        assert rate[axis] == pytest.approx(50.0 * GRAVITY * 0.02 * expected, rel=1e-9)
 
 
 def test_munk_moment_turns_the_body_broadside() -> None:
@@ -248,12 +211,12 @@ def test_munk_moment_turns_the_body_broadside() -> None:
 def test_body_lift_opposes_drift_and_weathercocks_going_ahead() -> None:
     """The centre of lift lies 0.2 m behind the origin; astern the lift still opposes the drift."""
     hull = m.block({"Y_uv": -40.0, "N_uv": 8.0, "Z_uw": -40.0, "M_uw": -8.0})
-    ahead = m.rates(hull, m.state_of(hull, np.array([1.0, 0.1, 0, 0, 0, 0])))
-    assert ahead[m.Y] == pytest.approx(-4.0 / 50.0) and ahead[m.N] == pytest.approx(0.8 / 7.0)
-    sinking = m.rates(hull, m.state_of(hull, np.array([1.0, 0, 0.1, 0, 0, 0])))
-    assert sinking[m.Z] == pytest.approx(-4.0 / 50.0) and sinking[m.M] == pytest.approx(-0.8 / 6.0)
-    astern = m.rates(hull, m.state_of(hull, np.array([-1.0, 0.1, 0, 0, 0, 0])))
-    assert astern[m.Y] == pytest.approx(-4.0 / 50.0) and astern[m.N] == pytest.approx(-0.8 / 7.0)
+    for u, across, force, turn, expected in (
+        (m.U, m.V, m.Y, m.N, 0.8 / 7.0), (m.U, m.W, m.Z, m.M, -0.8 / 6.0),
+        (-m.U, m.V, m.Y, m.N, -0.8 / 7.0),
+    ):  # fmt: skip
+        rate = m.rates(hull, m.state_of(hull, u + 0.1 * across))
+        assert rate[[force, turn]] == pytest.approx([-4.0 / 50.0, expected])
 
 
 @pytest.mark.parametrize("newtons", [2.0, -6.0])

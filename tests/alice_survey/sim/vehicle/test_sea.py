@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
 from alice_survey.core.errors import AliceError
 from alice_survey.core.frames import Array
@@ -204,25 +205,16 @@ def test_depths_at_nodes_between_them_and_beyond_the_edges() -> None:
 
 @settings(deadline=None)
 @given(
-    place=st.tuples(st.floats(-20.0, 20.0), st.floats(-20.0, 20.0)),
+    place=arrays(np.float64, 2, elements=st.floats(-20.0, 20.0)),
     altitude=st.floats(0.05, 8.0),
-    slopes=st.tuples(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5)),
-    lean=st.tuples(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5)),
+    tilts=arrays(np.float64, 4, elements=st.floats(-0.5, 0.5)),
 )
-def test_range_along_a_beam_to_a_slope(
-    place: tuple[float, float],
-    altitude: float,
-    slopes: tuple[float, float],
-    lean: tuple[float, float],
-) -> None:
+def test_range_along_a_beam_to_a_slope(place: Array, altitude: float, tilts: Array) -> None:
     """Closed form: the altitude straight down, over how fast the beam gains on the floor."""
-    floor = tilted(40.0, *slopes)
-    north, east = place
-    depth = 40.0 + slopes[0] * north + slopes[1] * east - altitude
-    beam = unit(np.array([*lean, 1.0]))
-    gaining = beam[2] - slopes[0] * beam[0] - slopes[1] * beam[1]
-    expected = altitude / gaining
-    found = floor_range(floor, north, east, depth, beam[0], beam[1], beam[2], 30.0)
+    slopes, beam = tilts[:2], unit(np.array([*tilts[2:], 1.0]))
+    depth = 40.0 + slopes @ place - altitude
+    expected = altitude / (beam[2] - slopes @ beam[:2])
+    found = floor_range(tilted(40.0, *slopes), *place, depth, *beam, 30.0)
     if expected < 29.9:
         assert found == pytest.approx(expected, abs=1e-6)
     elif expected > 30.1:

@@ -110,13 +110,6 @@ BUOYANCY_KG = 52.1
 BOTH = [shape.ALICE, shape.SPARUS2]
 
 
-def test_alice_is_as_long_as_its_lift_implies() -> None:
-    """Y_uv = -39.71 and M_uw = -8.498 hold for this hull and its nose."""
-    assert shape.ALICE.outline.length_m == pytest.approx(1.96, abs=1e-12)
-    assert shape.ALICE.outline.nose_x_m == 1.06
-    assert shape.ALICE.outline.diameter_m == shape.SPARUS2.outline.diameter_m
-
-
 @pytest.mark.parametrize("end", ["bow", "stern"])
 def test_lateral_thrusters_sit_as_far_out_as_they_fit(end: Literal["bow", "stern"]) -> None:
     """Points all over the thruster lie inside the hull; some do not when it moves 2 mm out."""
@@ -200,12 +193,9 @@ def test_ittc57_is_the_published_line(reynolds: float, friction: float) -> None:
     assert shape.ittc57(reynolds) == pytest.approx(friction, rel=4e-4)
 
 
-def test_ellipsoid_drag_by_hand() -> None:
-    """d / l = 1/4, C_f = 0.005: 0.11 + 0.08 + 0.01."""
+def test_drag_by_hand() -> None:
+    """An ellipsoid of d / l = 1/4, C_f = 0.005: 0.11 + 0.08 + 0.01; cylinders, and their ends."""
     assert shape.ellipsoid_drag(2.0, 0.5, 0.005) == pytest.approx(0.20, rel=1e-12)
-
-
-def test_cylinder_across_by_hand_and_at_its_ends() -> None:
     assert shape.cylinder_across(10.0) == pytest.approx(1.2 * 0.75, rel=1e-12)
     assert shape.cylinder_across(1.0) == pytest.approx(1.2 * 0.58, rel=1e-12)
     assert shape.cylinder_across(1e4) == 1.2
@@ -214,6 +204,10 @@ def test_cylinder_across_by_hand_and_at_its_ends() -> None:
 
 
 def test_body_lift_is_the_papers() -> None:
+    """Y_uv = -39.71 and M_uw = -8.498 hold for the hull of ALICE and its nose."""
+    outline = shape.ALICE.outline
+    assert outline.length_m == pytest.approx(1.96, abs=1e-12)
+    assert (outline.nose_x_m, outline.diameter_m) == (1.06, shape.SPARUS2.outline.diameter_m)
     y_uv, z_uw, m_uw, n_uv = shape.body_lift(1.96, 0.23, 1.06).values()
     assert y_uv == z_uw == pytest.approx(-39.71, rel=1e-3)
     assert m_uw == pytest.approx(-8.498, rel=1e-3)

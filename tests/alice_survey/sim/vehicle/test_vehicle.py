@@ -1,5 +1,6 @@
 """A vehicle as a value: matrices from its parts, coefficients by name, and the known vehicles."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,44 +13,38 @@ from alice_survey.sim.vehicle import vehicle as files
 from alice_survey.sim.vehicle.coefficients import Coefficients
 from alice_survey.sim.vehicle.propulsion import add_thrust
 from alice_survey.sim.vehicle.sea import GRAVITY
-from alice_survey.sim.vehicle.vehicle import SETS, RigidBody, vehicle_from
+from alice_survey.sim.vehicle.vehicle import SETS, vehicle_from
 from tests.alice_survey.sim.vehicle.motions import block
 from tests.oracles_shape import ALICE, SPARUS2
 
+Triple = tuple[float, float, float]
 METRES = st.tuples(*[st.floats(-0.5, 0.5)] * 3)
 
 
 @settings(deadline=None)
 @given(
     masses=st.tuples(st.floats(1.0, 80.0), st.floats(0.0, 40.0)),
-    cg=METRES,
-    cg_inside=METRES,
-    nu=st.tuples(*[st.floats(-2.0, 2.0)] * 6),
+    places=st.tuples(METRES, METRES),
+    nu=st.tuples(*[st.floats(-2.0, 2.0)] * 6).map(np.array),
 )
 def test_rigid_inertia_holds_the_energy_of_its_parts(
-    masses: tuple[float, float],
-    cg: tuple[float, float, float],
-    cg_inside: tuple[float, float, float],
-    nu: tuple[float, ...],
+    masses: tuple[float, float], places: tuple[Triple, Triple], nu: np.ndarray
 ) -> None:
     """1/2 nu M nu is that of each part's centre of gravity and of its turning about it."""
     inertias = ((0.5, 7.5, 7.4), (0.1, 2.0, 2.1))
-    body = RigidBody(
-        dry_kg=masses[0],
-        buoyancy_kg=50.0,
-        entrained_kg=masses[1],
-        cg_body_m=cg,
+    body = replace(
+        block(cg=places[0], dry_kg=masses[0], entrained_kg=masses[1]).rigid_body,
         inertia_kg_m2=inertias[0],
-        entrained_cg_body_m=cg_inside,
+        entrained_cg_body_m=places[1],
         entrained_inertia_kg_m2=inertias[1],
     )
-    linear, angular = np.array(nu[:3]), np.array(nu[3:])
+    linear, angular = nu[:3], nu[3:]
     energy = 0.0
-    for mass, place, inertia in zip(masses, (cg, cg_inside), inertias, strict=True):
+    for mass, place, inertia in zip(masses, places, inertias, strict=True):
         speed = linear + np.cross(angular, place)
         energy += 0.5 * mass * speed @ speed + 0.5 * angular @ (np.array(inertia) * angular)
     matrix = body.mass_matrix
-    assert 0.5 * np.array(nu) @ matrix @ np.array(nu) == pytest.approx(energy, rel=1e-9, abs=1e-12)
+    assert 0.5 * nu @ matrix @ nu == pytest.approx(energy, rel=1e-9, abs=1e-12)
     np.testing.assert_allclose(matrix, matrix.T, atol=1e-13)
 
 

@@ -181,22 +181,21 @@ def test_rows_equal_finite_differences(name: str) -> None:
     nav.nominal[24:26] = [0.2, -0.3]
     belief, rates = oracle.from_nominal(nav.nominal), nav.readings[nf.RATES : nf.RATES + 3].copy()
     # The last row that was weighed stays in scratch: of the beams the fourth.
-    reading: dict[str, Callable[[oracle.Belief], float]] = {
-        "heading": oracle.heading,
-        "depth": lambda b: oracle.depth(b, sensors),
-        "gps": lambda b: float(oracle.place(b, sensors, part.GPS)[1]),
-        "beams": lambda b: float(oracle.beams(b, sensors, rates, False)[3]),
-        "water": lambda b: float(oracle.beams(b, sensors, rates, True)[3]),
+    cases: dict[str, tuple[Callable[[oracle.Belief], float], Callable[[], object]]] = {
+        "heading": (oracle.heading, lambda: nf.use_heading(nav, sensors)),
+        "depth": (lambda b: oracle.depth(b, sensors), lambda: nf.use_depth(nav, sensors)),
+        "gps": (
+            lambda b: float(oracle.place(b, sensors, part.GPS)[1]),
+            lambda: nf.lever_row(nav, sensors, part.GPS, 1),
+        ),
+        "beams": (
+            lambda b: float(oracle.beams(b, sensors, rates, name == "water")[3]),
+            lambda: nf.use_beams(nav, sensors, name == "water"),
+        ),
     }
-    weigh: dict[str, Callable[[], object]] = {
-        "heading": lambda: nf.use_heading(nav, sensors),
-        "depth": lambda: nf.use_depth(nav, sensors),
-        "gps": lambda: nf.lever_row(nav, sensors, part.GPS, 1),
-        "beams": lambda: nf.use_beams(nav, sensors, False),
-        "water": lambda: nf.use_beams(nav, sensors, True),
-    }
-    weigh[name]()
-    expected = oracle.jacobian(lambda e: np.array([reading[name](belief.moved(e))]), 25)[0]
+    reading, weigh = cases["beams" if name == "water" else name]
+    weigh()
+    expected = oracle.jacobian(lambda e: np.array([reading(belief.moved(e))]), 25)[0]
     np.testing.assert_allclose(nav.scratch[nf.ROW], expected, atol=1e-8)
 
 

@@ -77,16 +77,12 @@ def test_the_circle_is_that_of_a_simulated_vehicle(
 
 def test_the_captain_waits_twice_the_way_and_half_a_minute() -> None:
     row = np.zeros(pilot.COLUMNS)
-    row[[pilot.SPEED, pilot.BY_DEPTH]] = 0.2, 1.0
     settings = pilot.Cola2Settings()
-    assert pilot.timeout_s(row, 10.0, 1.0, settings) == pytest.approx(
-        30 + 2 * math.sqrt(2) * 10 / 0.2
-    )
-    assert pilot.timeout_s(row, 1.0, -12.0, settings) == pytest.approx(30 + 2 * 12 / 0.3)
-    # By altitude: as if through the range of a DVL.
-    row[[pilot.BY_DEPTH, pilot.BY_ALTITUDE]] = 0.0, 1.0
-    assert pilot.timeout_s(row, 10.0, 1.0, settings) == pytest.approx(30 + 2 * 200 / 0.3)
-    row[pilot.SPEED] = 3.0  # no faster than the pilot's parameter
-    assert pilot.timeout_s(row, 900.0, 1.0, settings) == pytest.approx(
-        30 + 2 * math.sqrt(2) * 900 / 0.5
-    )
+    for asked, way_m, rise_m, seconds in (
+        ((0.2, 1.0, 0.0), 10.0, 1.0, math.sqrt(2) * 10 / 0.2),
+        ((0.2, 1.0, 0.0), 1.0, -12.0, 12 / 0.3),
+        ((0.2, 0.0, 1.0), 10.0, 1.0, 200 / 0.3),  # by altitude: as if through a DVL's range
+        ((3.0, 0.0, 1.0), 900.0, 1.0, math.sqrt(2) * 900 / 0.5),  # the pilot's greatest speed
+    ):
+        row[[pilot.SPEED, pilot.BY_DEPTH, pilot.BY_ALTITUDE]] = asked
+        assert pilot.timeout_s(row, way_m, rise_m, settings) == pytest.approx(30 + 2 * seconds)
