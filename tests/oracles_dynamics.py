@@ -11,17 +11,16 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
+from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.fins import Fin
 from alice_survey.sim.vehicle.propulsion import Thruster
 from alice_survey.sim.vehicle.sea import Current
 from alice_survey.sim.vehicle.vehicle import Vehicle
 from tests.oracles_propulsion import wrench as thrust_wrench
 
-Array = NDArray[np.float64]
 FORCES, MOTIONS = "XYZKMN", "uvwpqr"
 GRAVITY = 9.80665
 

@@ -10,12 +10,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.navigation.sensors import DVL, GPS, IMU, PRESSURE, USBL, Sensors
 
-Array = NDArray[np.float64]
 GRAVITY = np.array([0.0, 0.0, 9.80665])
 SCALE = 17
 MANOEUVRE_S = 5.0
@@ -43,14 +42,9 @@ class Belief:
 
     def error_of(self, other: "Belief") -> Array:
         """The error, (25,), by which the other is this one moved."""
-        return np.concatenate(
-            [
-                other.position - self.position,
-                other.velocity - self.velocity,
-                (other.attitude * self.attitude.inv()).as_rotvec(),
-                other.rest - self.rest,
-            ]
-        )
+        turned = (other.attitude * self.attitude.inv()).as_rotvec()
+        moved = (other.position - self.position, other.velocity - self.velocity)
+        return np.concatenate([*moved, turned, other.rest - self.rest])
 
 
 def from_nominal(nominal: Array) -> Belief:
@@ -87,11 +81,7 @@ def next_state(
 
 def jacobian(function: Callable[..., Array], size: int, step: float = 1e-5) -> Array:
     """Central differences about zero."""
-    columns = []
-    for i in range(size):
-        e = np.zeros(size)
-        e[i] = step
-        columns.append((function(e) - function(-e)) / (2 * step))
+    columns = [(function(e) - function(-e)) / (2 * step) for e in step * np.eye(size)]
     return np.stack(columns, axis=1)
 
 
@@ -115,11 +105,9 @@ def predict(
     sigma[21:23], sigma[23:25] = sensors.gps.bias_sigma_m, sensors.current_sigma_mps
     covariance = covariance + g @ q @ g.T
     covariance += np.diag(sigma**2 * (1 - kept(sensors, dt_s) ** 2))
-    walk = np.zeros(25)
-    walk[9:12], walk[12:15] = (
-        sensors.imu.gyro_bias_walk_radps_per_sqrt_s,
-        sensors.imu.accelerometer_bias_walk_mps2_per_sqrt_s,
-    )
+    imu, walk = sensors.imu, np.zeros(25)
+    walk[9:12] = imu.gyro_bias_walk_radps_per_sqrt_s
+    walk[12:15] = imu.accelerometer_bias_walk_mps2_per_sqrt_s
     return after, covariance + np.diag(walk**2 * dt_s), f
 
 
@@ -130,10 +118,8 @@ def heading(state: Belief) -> float:
 
 def place(state: Belief, sensors: Sensors, which: int) -> Array:
     """Where an instrument is, NED."""
-    position: Array = state.position + state.attitude.apply(
-        sensors.place[which] - sensors.place[IMU]
-    )
-    return position
+    lever = sensors.place[which] - sensors.place[IMU]
+    return np.asarray(state.position + state.attitude.apply(lever))
 
 
 def depth(state: Belief, sensors: Sensors) -> float:
@@ -143,8 +129,7 @@ def depth(state: Belief, sensors: Sensors) -> float:
 
 def gps(state: Belief, sensors: Sensors) -> Array:
     """What the GPS reads, north and east."""
-    fix: Array = place(state, sensors, GPS)[:2] + state.rest[12:14]
-    return fix
+    return np.asarray(place(state, sensors, GPS)[:2] + state.rest[12:14])
 
 
 def usbl(state: Belief, sensors: Sensors) -> Array:
@@ -160,8 +145,7 @@ def beams(state: Belief, sensors: Sensors, rates: Array, water: bool) -> Array:
     velocity = state.velocity + (1 + state.rest[SCALE - 9]) * spin
     seen = Rotation.from_euler("Z", state.rest[9]).inv().apply(velocity)
     bias = np.array([*state.rest[10:12], 0.0])
-    along: Array = sensors.beams @ (seen + bias)
-    return along
+    return np.asarray(sensors.beams @ (seen + bias))
 
 
 def update(

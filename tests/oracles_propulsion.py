@@ -5,12 +5,10 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
+from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.propulsion import Thruster
-
-Array = NDArray[np.float64]
 
 
 def inflow_mps(thruster: Thruster, nu: Array) -> float:

@@ -45,17 +45,6 @@ DENSITY = 1025.0
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
 
 
-class Strips(NamedTuple):
-    """Places along an outline with weights: `sum(weight * f(x, r))` is the integral of f over x.
-
-    With 4 Gauss points a segment it is exact for polynomials in x up to the 7th degree.
-    """
-
-    x_m: Array
-    radius_m: Array
-    weight_m: Array
-
-
 @dataclass(frozen=True, kw_only=True)
 class Outline:
     """Radius r(x) of a body of revolution, from its tail to its nose."""
@@ -88,13 +77,17 @@ class Outline:
         """r(x), metres, zero beyond the ends."""
         return np.interp(x_m, self.x_m, self.radius_m, left=0.0, right=0.0)
 
-    def strips(self, breaks_m: tuple[float, ...] = ()) -> Strips:
-        """Places to integrate at; segments are also cut at x = 0, for |x|, and at given places."""
+    def strips(self, breaks_m: tuple[float, ...] = ()) -> Array:
+        """(3, N) x, radius and weight of strips: `sum(w * f(x, r))` is the integral of f over x.
+
+        Segments are also cut at x = 0, for |x|, and at given places. With 4 Gauss points a segment
+        it is exact for polynomials in x up to the 7th degree.
+        """
         inner = [b for b in (0.0, *breaks_m) if self.tail_x_m < b < self.nose_x_m]
         knots = np.unique([*self.x_m, *inner])
         half, middle = np.diff(knots) / 2.0, (knots[1:] + knots[:-1]) / 2.0
         x = (middle[:, None] + half[:, None] * _NODES).ravel()
-        return Strips(x, self.radius_at(x), (half[:, None] * _WEIGHTS).ravel())
+        return np.stack([x, self.radius_at(x), (half[:, None] * _WEIGHTS).ravel()])
 
     @cached_property
     def volume_m3(self) -> float:
@@ -153,9 +146,9 @@ class Pod(NamedTuple):
     """Distance of its axis from the middle plane."""
 
     @property
-    def body_volume_m3(self) -> float:
-        """Solid volume: the motor body as a cylinder; the nozzle is open."""
-        return math.pi / 4.0 * self.body_diameter_m**2 * self.outline.length_m
+    def volume_m3(self) -> float:
+        """Solid volume of both: motor bodies as cylinders; the nozzles are open."""
+        return math.pi / 2.0 * self.body_diameter_m**2 * self.outline.length_m
 
 
 class PodArm(NamedTuple):
@@ -211,16 +204,15 @@ class Geometry:
     @cached_property
     def envelope_volume_m3(self) -> float:
         """Volume of hull, mast and pods, water inside the hull included."""
-        return self.outline.volume_m3 + self.mast.volume_m3 + 2.0 * self.pod.body_volume_m3
+        return self.outline.volume_m3 + self.mast.volume_m3 + self.pod.volume_m3
 
     @cached_property
     def envelope_x_m(self) -> float:
         """The x of the centre of the envelope."""
-        pods = 2.0 * self.pod.body_volume_m3
         moment = (
             self.outline.volume_m3 * self.outline.volume_x_m
             + self.mast.volume_m3 * self.mast.x_m
-            + pods * self.pod.outline.volume_x_m
+            + self.pod.volume_m3 * self.pod.outline.volume_x_m
         )
         return moment / self.envelope_volume_m3
 
@@ -367,9 +359,9 @@ def _moments(outline: Outline, aft_x: float, fore_x: float) -> Array:
     """Volume, its first and second moment about x = 0, and the integral of pi r^4 / 4."""
     if fore_x <= aft_x:
         return np.zeros(4)
-    x, r, w = outline.strips(breaks_m=(aft_x, fore_x))
-    within = (x > aft_x) & (x < fore_x)
-    x, area, w = x[within], np.pi * r[within] ** 2, w[within]
+    strips = outline.strips(breaks_m=(aft_x, fore_x))
+    x, r, w = strips[:, (strips[0] > aft_x) & (strips[0] < fore_x)]
+    area = np.pi * r**2
     across = area**2 / (4.0 * np.pi)
     return np.array([np.sum(w * f) for f in (area, area * x, area * x**2, across)])
 
@@ -424,14 +416,6 @@ def finned_circle_roll(radius_m: Array, span_m: float) -> Array:
     a = np.pi - np.arcsin(np.clip(sine, 0.0, 1.0))
     bracket = 2.0 * a**2 - a * np.sin(4.0 * a) + 0.5 * np.sin(2.0 * a) ** 2
     return DENSITY * r**4 * (bracket / (np.pi * sine**4) - np.pi / 2.0)
-
-
-def elliptic_section(across_m: float) -> float:
-    """Added mass of an elliptic section, kg/m: rho pi / 4 of its square width across the flow.
-
-    The paper's mast: (1/4) pi rho w_m^2 h_m in surge, (1/4) pi rho c_m^2 h_m in sway.
-    """
-    return DENSITY * math.pi / 4.0 * across_m**2
 
 
 CYLINDER_CD = 1.2
@@ -593,7 +577,7 @@ def _hull(geometry: Geometry) -> HullPart:
     outline, mount = geometry.outline, geometry.mount
     breaks = (mount.aft_x_m, mount.fore_x_m)
     hull = _revolved("hull", outline, outline.diameter_m, 0.0, 0.0, breaks)
-    strips = np.array(outline.strips(breaks))
+    strips = outline.strips(breaks)
     x, r, w = strips[:, (strips[0] > mount.aft_x_m) & (strips[0] < mount.fore_x_m)]
     more = finned_circle_section(r, mount.tip_y_m) - DENSITY * np.pi * r**2
     added = hull.added_mass + inertia_of(_on_axis(x), _DOWN, w * more)
@@ -602,7 +586,11 @@ def _hull(geometry: Geometry) -> HullPart:
 
 
 def _mast(mast: Mast) -> HullPart:
-    """Elliptic strips up its height; a plate across, on the hull as on a wall; a strut along."""
+    """Elliptic strips up its height; a plate across, on the hull as on a wall; a strut along.
+
+    Added mass of an elliptic section, kg/m: rho pi / 4 of its square width across the flow. The
+    paper's mast: (1/4) pi rho w_m^2 h_m in surge, (1/4) pi rho c_m^2 h_m in sway.
+    """
     z = mast.middle_z_m + mast.height_m / 2.0 * _NODES
     w = mast.height_m / 2.0 * _WEIGHTS
     points = np.column_stack([np.full(4, mast.x_m), np.zeros(4), z])
@@ -610,8 +598,8 @@ def _mast(mast: Mast) -> HullPart:
     across = plate_across(2.0 * mast.height_m / mast.chord_m)
     return HullPart(
         "mast",
-        inertia_of(points, _FORWARD, w * elliptic_section(mast.width_m))
-        + inertia_of(points, _STARBOARD, w * elliptic_section(mast.chord_m)),
+        inertia_of(points, _FORWARD, w * DENSITY * math.pi / 4.0 * mast.width_m**2)
+        + inertia_of(points, _STARBOARD, w * DENSITY * math.pi / 4.0 * mast.chord_m**2),
         drag_of(points, _FORWARD, 0.5 * DENSITY * along * mast.width_m * w)
         + drag_of(points, _STARBOARD, 0.5 * DENSITY * across * mast.chord_m * w),
     )

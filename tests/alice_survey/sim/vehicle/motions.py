@@ -5,17 +5,15 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from alice_survey.core.frames import attitude_from_rotation
+from alice_survey.core.frames import Array, attitude_from_rotation
 from alice_survey.sim.vehicle.coefficients import Coefficients
 from alice_survey.sim.vehicle.dynamics import Body, derivative, initial_state, rk4_step, scratch_for
 from alice_survey.sim.vehicle.propulsion import Thruster
 from alice_survey.sim.vehicle.sea import Current, constant_current
 from alice_survey.sim.vehicle.vehicle import RigidBody, Vehicle, vehicle_from
 
-Array = NDArray[np.float64]
 NOTHING = np.zeros(6)
 STILL = constant_current(0.0, 0.0)
 SHEAR_AND_TIDE = Current(

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.fins import (
     Fin,
     Fins,
@@ -24,7 +24,6 @@ from tests import oracles_dynamics as oracle
 from tests.alice_survey.sim.vehicle.motions import advance, rates, state_of
 from tests.oracles_navigation import jacobian
 
-Array = NDArray[np.float64]
 REMUS = vehicle_from("remus100")
 PLANE = Fin(
     name="plane", positions_body_m=((-0.6, 0.1, 0.02),), shaft_body=(0.0, 1.0, 0.0), area_m2=0.01,

@@ -20,10 +20,10 @@ STILL = Disturbance()
 GUSTS = Disturbance(sigma=(3.0, 3.0, 3.0, 0.0, 0.0, 0.0))
 
 
-def setup(disturbance: Disturbance = STILL) -> Setup:
+def flown(disturbance: Disturbance = STILL, seed: int = 1, max_s: float = 300.0) -> Flown:
     """A line of 6 m, 2 m above a floor at 5 m."""
     path, gains = straight(6.0, 0.3), gains_of("alice")
-    return Setup(
+    setup = Setup(
         vehicle=vehicle_from("alice"),
         path=path,
         guidance=pilot_guidance(gains, path, "sway", max_depth_m=5.0),
@@ -34,16 +34,12 @@ def setup(disturbance: Disturbance = STILL) -> Setup:
         disturbance=disturbance,
         start_heading_rad=0.3,
     )
+    return simulate(setup, np.random.default_rng(seed), max_s=max_s, label="test")
 
 
 @pytest.fixture(scope="module")
 def calm() -> Flown:
-    return simulate(setup(), np.random.default_rng(1), max_s=300.0, label="test")
-
-
-@pytest.fixture(scope="module")
-def gusty() -> Flown:
-    return simulate(setup(GUSTS), np.random.default_rng(1), max_s=300.0, label="test")
+    return flown()
 
 
 def test_a_mission_passes_through_its_phases_in_order(calm: Flown) -> None:
@@ -79,9 +75,8 @@ def test_commands_replayed_give_the_same_motion(calm: Flown) -> None:
     np.testing.assert_array_equal(state, calm.state[-1])
 
 
-def test_the_same_seed_flies_the_same_way_and_another_does_not(gusty: Flown) -> None:
-    again = simulate(setup(GUSTS), np.random.default_rng(1), max_s=300.0, label="test")
-    other = simulate(setup(GUSTS), np.random.default_rng(2), max_s=300.0, label="test")
+def test_the_same_seed_flies_the_same_way_and_another_does_not() -> None:
+    gusty, again, other = (flown(GUSTS, seed) for seed in (1, 1, 2))
     np.testing.assert_array_equal(again.state, gusty.state)
     np.testing.assert_array_equal(again.navigation, gusty.navigation)
     rows = min(len(other.state), len(gusty.state))
@@ -96,6 +91,6 @@ def test_velocity_over_ground_is_that_through_water_and_the_current(calm: Flown)
 
 
 def test_a_mission_that_takes_too_long_is_broken_off_where_it_is() -> None:
-    flown = simulate(setup(), np.random.default_rng(1), max_s=10.0, label="test")
-    assert len(flown.time_s) == 200
-    assert flown.report[-1, PHASE] == DIVE
+    short = flown(max_s=10.0)
+    assert len(short.time_s) == 200
+    assert short.report[-1, PHASE] == DIVE

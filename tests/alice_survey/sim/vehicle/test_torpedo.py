@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from alice_survey.core.errors import VehicleError
+from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle import steady
 from alice_survey.sim.vehicle.identification.report import IdentifyOptions, identify_report
 from alice_survey.sim.vehicle.pilot import gains as g
@@ -21,8 +21,8 @@ from alice_survey.sim.vehicle.pilot.settings import UnderWay, circle_course, div
 from alice_survey.sim.vehicle.vehicle import vehicle_from
 from tests import oracles_dynamics as oracle
 from tests.alice_survey.sim.vehicle.motions import STILL
+from tests.oracles_shape import alpha_0
 
-Array = NDArray[np.float64]
 REMUS = vehicle_from("remus100")
 SHARE = g.STEADY_SHARE
 RHO, FIN_M2, FIN_X = 1030.0, 0.00665, -0.638
@@ -88,7 +88,7 @@ def test_the_tightest_turn_is_one_that_fins_hold() -> None:
     assert steady.fin_flight(REMUS, 1.0, 1.0 / (0.98 * radius), SHARE) is None
 
 
-def test_what_cannot_be_flown_by_fins_is_said() -> None:
+def test_what_cannot_be_done_by_fins_is_said(tmp_path: Path) -> None:
     up = replace(
         REMUS.thrusters[0], name="vertical", direction_body=(0.0, 0.0, 1.0),
         position_body_m=(0.0, 0.0, 0.0),
@@ -99,6 +99,8 @@ def test_what_cannot_be_flown_by_fins_is_said() -> None:
         g.gains_for(replace(REMUS, thrusters=()), 1.0)
     with pytest.raises(VehicleError, match="at no speed"):
         steady.min_speed_mps(replace(REMUS, fins=REMUS.fins[1:]), SHARE)
+    with pytest.raises(VehicleError, match="steered by fins"):
+        identify_report([], tmp_path, IdentifyOptions(vehicle="remus100"))
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
@@ -119,11 +121,6 @@ def test_the_circle_leads_through_its_goal_with_its_heading(side: float) -> None
         assert np.hypot(*off) == pytest.approx(8.0, abs=0.05)
         ahead = np.array([math.cos(course), math.sin(course)])
         assert np.sign(off[0] * ahead[1] - off[1] * ahead[0]) == side
-
-
-def test_logs_of_it_are_not_identified_as_if_it_had_no_fins(tmp_path: Path) -> None:
-    with pytest.raises(VehicleError, match="steered by fins"):
-        identify_report([], tmp_path, IdentifyOptions(vehicle="remus100"))
 
 
 @cache
@@ -170,8 +167,7 @@ def test_added_masses_are_those_of_its_sections() -> None:
     assert named["Y_vdot"] == pytest.approx(-along(strip), rel=0.06)
     assert named["N_rdot"] == pytest.approx(-along(strip * x**2), rel=0.12)
     assert 0.0 < named["Y_rdot"] < 1.1 * -along(strip * x) * 1.0 + 1.0
-    e = math.sqrt(1 - (0.191 / 1.33) ** 2)
-    alpha = 2 * (1 - e**2) / e**3 * (0.5 * math.log((1 + e) / (1 - e)) - e)
+    alpha = alpha_0(1.33, 0.191)
     surge = alpha / (2 - alpha) * 4 / 3 * math.pi * RHO * 0.665 * 0.0955**2
     assert named["X_udot"] == pytest.approx(-surge, rel=0.03)
     assert named["X_uu"] == pytest.approx(-0.5 * RHO * 0.2 * 0.0285, rel=0.01)

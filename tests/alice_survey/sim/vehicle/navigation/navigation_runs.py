@@ -3,17 +3,16 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from alice_survey.core.compiled import kernel
+from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.estimate_vector import ESTIMATE
 from alice_survey.sim.vehicle.navigation import filter as nf
 from alice_survey.sim.vehicle.navigation.sensors import IMU, Sensors
 from alice_survey.sim.vehicle.navigation.tick import LOG_ROW, log_row, navigation_tick
 from alice_survey.sim.vehicle.sea import FloorGrid
 
-Array = NDArray[np.float64]
 TICK_S = 0.05
 
 
