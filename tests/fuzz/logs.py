@@ -35,7 +35,6 @@ from tests.missions.exports.plans import RIG, line, plan_of
 from tests.missions.logs.log_files import Bag, dataflash_log, tlog
 from tests.missions.logs.test_import_ulog import dive, ulog
 
-_HERE = Path(__file__).parent
 _START_NS = 1_714_564_800_000_000_000
 
 

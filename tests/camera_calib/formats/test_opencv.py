@@ -8,13 +8,12 @@ import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import Rotation
 
 from camera_calib.formats.opencv import read_opencv, write_opencv
 from camera_calib.formats.rigs import ReadOptions
 from camera_calib.lenses.fisheye import FisheyeLens
 from camera_calib.rig import Rig
-from tests.cameras import changed, flat_port_camera, pair_of
 from tests.strategies_formats import (
     BOTH_LENSES,
     POINTS_RIG,
@@ -24,14 +23,6 @@ from tests.strategies_formats import (
     rigs,
 )
 
-AIR = flat_port_camera(
-    width_px=640, height_px=480, fx_px=530.0, fy_px=531.0, cx_px=320.25, cy_px=241.0, n_water=1.0
-)
-STEREO = pair_of(
-    AIR,
-    changed(AIR, fx_px=540.0, k1=-0.1),
-    RigidTransform.from_components([-0.1, 0, 0], Rotation.from_rotvec([0, 0.01, 0])),
-)
 MATRIX = "!!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n   data: "
 GOOD = (
     "%YAML:1.0\n---\nimage_width: 640\nimage_height: 480\n"

@@ -10,6 +10,7 @@ import pytest
 
 from alice_survey.core.errors import CalibrationError
 from camera_calib.targets.detect import Detection, chessboard_size, detect
+from camera_calib.targets.grow import grown_chessboard
 from camera_calib.targets.target import Target, parse_target
 from tests.oracles_targets import picture_light, seen_from, to_srgb, true_pixels
 
@@ -168,6 +169,7 @@ def test_pictures_without_the_target_are_refused_with_a_reason(text: str, name: 
     picture = NO_TARGET[name]
     found = detect(parse_target(text), picture)
     assert found.pixels is None and chessboard_size(picture) is None
+    assert grown_chessboard(picture, (4, 4)) is None
     (rejection,) = found.rejections("07", "left")
     assert (rejection.view, rejection.camera, rejection.points) == ("07", "left", 0)
     assert rejection.reason
