@@ -214,7 +214,8 @@ def test_range_along_a_beam_to_a_slope(place: Array, altitude: float, tilts: Arr
     slopes, beam = tilts[:2], unit(np.array([*tilts[2:], 1.0]))
     depth = 40.0 + slopes @ place - altitude
     expected = altitude / (beam[2] - slopes @ beam[:2])
-    found = floor_range(tilted(40.0, *slopes), *place, depth, *beam, 30.0)
+    floor = tilted(40.0, *slopes)
+    found = floor_range(floor, place[0], place[1], depth, beam[0], beam[1], beam[2], 30.0)
     if expected < 29.9:
         assert found == pytest.approx(expected, abs=1e-6)
     elif expected > 30.1:
