@@ -212,7 +212,7 @@ def test_depths_at_nodes_between_them_and_beyond_the_edges() -> None:
 def test_range_along_a_beam_to_a_slope(place: Array, altitude: float, tilts: Array) -> None:
     """Closed form: the altitude straight down, over how fast the beam gains on the floor."""
     slopes, beam = tilts[:2], unit(np.array([*tilts[2:], 1.0]))
-    depth = 40.0 + slopes @ place - altitude
+    depth = 40.0 + float(slopes @ place) - altitude
     expected = altitude / (beam[2] - slopes @ beam[:2])
     floor = tilted(40.0, *slopes)
     found = floor_range(floor, place[0], place[1], depth, beam[0], beam[1], beam[2], 30.0)

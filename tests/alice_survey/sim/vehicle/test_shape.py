@@ -147,11 +147,8 @@ def test_water_fills_what_the_dry_vehicle_leaves_and_balances_it(geometry: shape
     np.testing.assert_allclose(inside.inertia_kg_m2, [mass @ r**2 / 2.0, pitch, pitch], rtol=2e-3)
     assert outline.tail_x_m < inside.tail_to_x_m < 0 < inside.nose_from_x_m < outline.nose_x_m
 
-
-@pytest.mark.parametrize("geometry", BOTH)
-def test_the_program_holds_what_follows_from_the_shapes(geometry: shape.Geometry) -> None:
+    # The program holds what follows from the shapes.
     held = SHAPES[geometry.name]
-    inside = shape.entrained_water(geometry, BUOYANCY_KG)
     water = [inside.mass_kg, inside.x_m, 0.0, 0.0, *inside.inertia_kg_m2]
     body = held["rigid_body"]
     np.testing.assert_allclose(
