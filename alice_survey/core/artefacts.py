@@ -305,7 +305,7 @@ def refuse_damage(folder: Path, record: StageRecord | None) -> None:
     """
     damaged = None if record is None else damage(folder, record, exports=False)
     if record is not None and damaged is not None:
-        raise _damaged(folder, record, damaged)
+        raise _damage_error(folder, record, damaged)
 
 
 def read_stage(folder: Path) -> StageRecord | None:
@@ -372,7 +372,7 @@ def _is_entry(path: Path, now: FileEntry, written: FileEntry) -> bool:
     return now[2] == written[2]
 
 
-def _damaged(folder: Path, record: StageRecord, damaged: str) -> WorkspaceError:
+def _damage_error(folder: Path, record: StageRecord, damaged: str) -> WorkspaceError:
     again = f"'alice-survey {record.command}'" if record.command else "the command that wrote it"
     return WorkspaceError(f"{folder}: {damaged}; run {again} again, which makes it anew")
 
@@ -406,13 +406,13 @@ def _intact_inputs(inputs: Sequence[Path], workspace: Path) -> dict[str, FileEnt
             for name in record.outputs:
                 path = folder / name
                 if not path.exists() and not given.isdisjoint((path, *path.parents)):
-                    raise _damaged(folder, record, f"{name} is missing")
+                    raise _damage_error(folder, record, f"{name} is missing")
     found = digest_inputs(inputs, workspace, None)
     for folder, record in makers.items():
         for name, entry in record.outputs.items():
             now = found.get(os.path.relpath(folder / name, workspace), entry)
             if not name.startswith(f"{EXPORTS}/") and not _is_entry(folder / name, now, entry):
-                raise _damaged(folder, record, f"{name} has changed since it was written")
+                raise _damage_error(folder, record, f"{name} has changed since it was written")
     return found
 
 

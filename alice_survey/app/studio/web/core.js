@@ -13,8 +13,7 @@ if (given) {
 /* Whether this page may change anything: it was opened by the address with the token. */
 export const mayWrite = () => Boolean(sessionStorage.getItem(key));
 
-/* For an address that is used outside of this page, which has no cookie. */
-export const tokenQuery = () => (mayWrite() ? "?token=" + sessionStorage.getItem(key) : "");
+export const asToken = () => (mayWrite() ? "?token=" + sessionStorage.getItem(key) : "");
 
 async function asked(address, options) {
   let response = null;
@@ -32,10 +31,8 @@ async function asked(address, options) {
     status: response.status});
 }
 
-const addressOf = (path, params) => {
-  const query = new URLSearchParams(params || {}).toString();
-  return query ? path + "?" + query : path;
-};
+const addressOf = (path, params) =>
+  [path, new URLSearchParams(params || {}).toString()].filter(Boolean).join("?");
 
 export async function get(path, params, options) {
   return (await asked(addressOf(path, params), options)).json();

@@ -1,7 +1,6 @@
 /* The tab Model: values under the pointer, measures with their sigmas, the mesh, the files. */
 
-import {attempt, button, el, field, get, missing, save, say, send, table, tokenQuery}
-  from "./core.js";
+import {attempt, button, el, field, get, missing, save, say, send, table, asToken} from "./core.js";
 import {RED} from "./palette.js";
 import {counted, number, withSigma} from "./words.js";
 import {drawingTool} from "./drawing.js";
@@ -235,7 +234,7 @@ export function tab(studio) {
   const files = el("details", {}, el("summary", {}, "Files"), links, el("p", {class: "note"},
     "A GIS reads rasters from here part by part, without a copy: in QGIS add a raster layer with "
       + "the protocol HTTP(S) and the address "
-    + window.location.origin + "/files/mosaic/mosaic.tif" + tokenQuery()));
+    + window.location.origin + "/files/mosaic/mosaic.tif" + asToken()));
 
   const mesh = meshPart(
     studio, {colour: RED, measured: (points) => measure("length",

@@ -2,10 +2,8 @@
 
 import {attempt, el, get, mayWrite, say} from "./core.js";
 
-const state = await get("/api/state").catch((fault) => {
-  say(fault.message, "error");
-  throw fault;
-});
+const state = await attempt(() => get("/api/state"));
+if (!state) throw new Error("without a state nothing is shown");
 document.title = state.name + " – alice-survey";
 document.getElementById("title").textContent = state.name;
 
@@ -188,9 +186,7 @@ async function begin() {
     ? "run" : "plan";
   open(tabs.has(window.location.hash.slice(1)) ? window.location.hash.slice(1) : first);
   window.addEventListener("hashchange", () => open(window.location.hash.slice(1)));
-  if (!mayWrite()) say(
-    "Opened without its token: this page looks, and changes nothing. The command printed the "
-      + "address with it.", "warn");
+  if (!mayWrite()) say("Opened without its token: this page looks, and changes nothing.", "warn");
   document.body.dataset.ready = "";
 }
 
