@@ -1,5 +1,6 @@
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -7,9 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey.core.frames import Datum
 from alice_survey.core.manifest import ImageRecord
 from reconstruct.placing.alignment import Similarity, align_rigid, align_similarity, level
 from reconstruct.placing.fit import PlacementFit, fit_navigation
+from tests.reconstruct.placing.test_sigmas import gauss_markov
 from tests.reconstruct.scenes import DATUM, Scene, make_scene, stating
 
 
@@ -21,30 +24,36 @@ def gauge(seed: int, scale: float) -> Similarity:
     )
 
 
-def in_model(pose: RigidTransform, ned_from_model: Similarity) -> RigidTransform:
-    rotation = ned_from_model.rotation.inv()
-    place = rotation.apply(pose.translation - ned_from_model.translation) / ned_from_model.scale
-    return RigidTransform.from_components(place, rotation * pose.rotation)
-
-
 def points_in_model(points: np.ndarray, ned_from_model: Similarity) -> np.ndarray:
     moved = ned_from_model.rotation.inv().apply(points - ned_from_model.translation)
     return moved / ned_from_model.scale
 
 
+def in_model(pose: RigidTransform, ned_from_model: Similarity) -> RigidTransform:
+    place = points_in_model(pose.translation, ned_from_model)
+    return RigidTransform.from_components(place, ned_from_model.rotation.inv() * pose.rotation)
+
+
 def fit(
-    scene: Scene, records: list[ImageRecord], truth: Similarity, *, known: bool, levers: bool = True
-) -> PlacementFit:
+    scene: Scene, records: list[ImageRecord], truth: Similarity, *, known: bool,
+    levers: bool = True, datum: Datum | None = DATUM, lean_deg: float = 0.0,
+) -> PlacementFit:  # fmt: skip
+    """Of a model that starts level but for a lean; None where navigation does not suffice."""
     poses = [in_model(pose, truth) for pose in scene.ned_from_cam]
     points = points_in_model(scene.points_ned, truth)
-    centres = np.stack([p.translation for p in poses])
+    start = level(points, np.stack([p.translation for p in poses]))
+    lean = Rotation.from_euler("xy", [lean_deg, -lean_deg], degrees=True)
     arms = {name: scene.rig.body_from_cam(name) for name in scene.rig.cameras}
-    found = fit_navigation(
-        records, poses, arms if levers else None, DATUM, level(points, centres),
-        known_scale=truth.scale if known else None,
+    found: Any = fit_navigation(
+        records, poses, arms if levers else None, datum,
+        replace(start, rotation=lean * start.rotation), known_scale=truth.scale if known else None,
     )  # fmt: skip
-    assert found is not None
     return found
+
+
+def tilt_deg(found: Similarity, truth: Similarity) -> float:
+    down = (found.rotation * truth.rotation.inv()).apply([0.0, 0.0, 1.0])
+    return float(np.rad2deg(np.arccos(np.clip(down[2], -1, 1))))
 
 
 def exact(scene: Scene) -> list[ImageRecord]:
@@ -59,9 +68,8 @@ def exact(scene: Scene) -> list[ImageRecord]:
 def without_attitude(scene: Scene) -> list[ImageRecord]:
     """Positions of the cameras themselves, nothing more, as GPS in EXIF gives them."""
     places = np.stack([pose.translation for pose in scene.ned_from_cam])
-    return stating(
-        scene.records, places, roll_deg=np.nan, sigma_horizontal_m=0.02, sigma_depth_m=0.02
-    )
+    sigmas = {"sigma_horizontal_m": 0.02, "sigma_depth_m": 0.02}
+    return stating(scene.records, places, roll_deg=np.nan, **sigmas)
 
 
 def assert_same(found: Similarity, truth: Similarity, atol: float, scale_rtol: float) -> None:
@@ -121,19 +129,14 @@ def test_a_straight_line_is_kept_from_turning_about_itself() -> None:
     scene = make_scene(lines=1, stations=12, points=600)
     truth = gauge(5, 2.0)
     found = fit(scene, without_attitude(scene), truth, known=False, levers=False)
-    down = (found.ned_from_model.rotation * truth.rotation.inv()).apply([0.0, 0.0, 1.0])
-    assert np.rad2deg(np.arccos(down[2])) < 6.0
+    assert tilt_deg(found.ned_from_model, truth) < 6.0
 
 
-def exif(scene: Scene, seed: int, drift_m: float, correlated_s: float) -> list[ImageRecord]:
+def exif(scene: Scene, seed: int) -> list[ImageRecord]:
     """GPS of 3 m as EXIF has it over a block of 4 by 2 m: one error, a little of which drifts."""
     rng = np.random.default_rng(seed)
     count = 1 + max(record.station for record in scene.records)
-    errors = np.zeros((count, 3))
-    errors[0] = rng.normal(0, drift_m, 3)
-    kept = np.exp(-2.0 / correlated_s)
-    for k in range(1, count):
-        errors[k] = kept * errors[k - 1] + np.sqrt(1 - kept**2) * rng.normal(0, drift_m, 3)
+    errors = 0.3 * gauss_markov(rng, count, 20.0, step_s=2.0)[:, :3]
     errors += rng.normal(0, 3.0, 3) + rng.normal(0, 0.1, errors.shape)
     at = np.array([record.station for record in scene.records])
     places = np.stack([pose.translation for pose in scene.ned_from_cam]) + errors[at]
@@ -146,8 +149,7 @@ def test_positions_closer_than_their_sigma_give_a_rough_scale_with_an_honest_sig
 ) -> None:
     misses, sigmas = [], []
     for seed in range(16):
-        found = fit(site(), exif(site(), seed, 0.3, 20.0), gauge(seed, 2.0), known=False,
-                    levers=False)  # fmt: skip
+        found = fit(site(), exif(site(), seed), gauge(seed, 2.0), known=False, levers=False)
         (line,) = capsys.readouterr().err.splitlines()
         assert "rough" in line and "alice-survey control" in line
         misses.append(np.log(found.ned_from_model.scale / 2.0) / found.sigma_scale)

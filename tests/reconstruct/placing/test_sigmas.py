@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.frames import Array, Datum, rotation_from_attitude
@@ -33,25 +34,23 @@ STEP_S = 2.5
 
 def flight(lines: int = 4, stations: int = 12) -> RigidTransform:
     """True poses of the body along lawnmower lines 1 m apart, a picture every half metre."""
-    places, headings = [], []
-    for line in range(lines):
-        for step in range(stations):
-            at = step if line % 2 == 0 else stations - 1 - step
-            places.append([0.5 * at, 1.0 * line, 13.0])
-            headings.append(0.0 if line % 2 == 0 else np.pi)
-    rng = np.random.default_rng(99)
-    lean = rng.normal(0, np.deg2rad(1.5), (len(places), 2))
-    attitudes = rotation_from_attitude(lean[:, 0], lean[:, 1], np.array(headings))
-    return RigidTransform.from_components(np.array(places), attitudes)
+    line, step = np.divmod(np.arange(lines * stations), stations)
+    at = np.where(line % 2 == 0, step, stations - 1 - step)
+    lean = np.random.default_rng(99).normal(0, np.deg2rad(1.5), (len(at), 2))
+    attitudes = rotation_from_attitude(*lean.T, np.pi * (line % 2))
+    return RigidTransform.from_components(
+        np.column_stack([0.5 * at, line, np.full(len(at), 13.0)]), attitudes
+    )
 
 
-def gauss_markov(rng: np.random.Generator, count: int, tau_s: float) -> Array:
-    """(count, 6) stationary errors of unit variance at steps of `STEP_S`."""
-    kept = np.exp(-STEP_S / tau_s)
+def gauss_markov(
+    rng: np.random.Generator, count: int, tau_s: float, step_s: float = STEP_S
+) -> Array:
+    """(count, 6) stationary errors of unit variance at equal steps."""
+    kept = np.exp(-step_s / tau_s)
     errors = rng.normal(size=(count, 6))
-    for i in range(1, count):
-        errors[i] = kept * errors[i - 1] + np.sqrt(1 - kept**2) * errors[i]
-    return errors
+    errors[1:] *= np.sqrt(1 - kept**2)
+    return np.asarray(lfilter([1.0], [1.0, -kept], errors, axis=0))
 
 
 def records_of(body: RigidTransform, errors: Array, sigma: Array) -> list[ImageRecord]:
@@ -116,10 +115,9 @@ def place(
     )
     truth, poses, levelled = own_frame(rng, body * BODY_FROM_CAM["cam"] * noise)
     options.setdefault("known_scale", 1.0)
-    fit = fit_navigation(
+    fit: Any = fit_navigation(
         records, poses, BODY_FROM_CAM, DATUM, levelled, **options,  # type: ignore[arg-type]
     )  # fmt: skip
-    assert fit is not None
     errors = np.r_[errors_of(fit, truth, poses), np.log(fit.ned_from_model.scale)]
     sigma = np.sqrt(np.diag(fit.covariance))
     return fit, errors, np.r_[sigma[3:6], sigma[:3], sigma[6]]
@@ -143,8 +141,7 @@ def test_correlation_is_found() -> None:
         fit, _, _ = place(body, flown(body, 3, tau_s), 3)
         for group in ("horizontal", "depth", "heading"):
             how = fit.correlation[group]
-            decay = how.tau if how.white < 0.5 else 0.5
-            assert low / 2 <= decay <= high, (group, how)
+            assert low / 2 <= (how.tau if how.white < 0.5 else 0.5) <= high, (group, how)
         assert all("correlation_s" in how for how in fit.record.errors.values())
 
 
@@ -429,11 +426,10 @@ def fitted(seed: int, factor: float) -> tuple[PlacementFit, Array]:
     own, poses, levelled = own_frame(rng, bent)
     turn = own.inv().rotation.as_matrix()
     modes[:, :3], modes[:, 3:] = turn @ modes[:, :3], turn @ modes[:, 3:]
-    fit = fit_navigation(
+    fit: Any = fit_navigation(
         flown(body, [4, seed], 1.0), poses, BODY_FROM_CAM, DATUM, levelled,
         known_scale=1.0, modes=modes,
     )  # fmt: skip
-    assert fit is not None
     return fit, fit.modes - sizes
 
 
@@ -474,8 +470,7 @@ def bends_of(
         cameras.translation + np.column_stack([zero, zero, down]), turns * cameras.rotation
     )
     _, poses, levelled = own_frame(rng, bent)
-    fit = fit_navigation(records, poses, BODY_FROM_CAM, DATUM, levelled, known_scale=1.0)
-    assert fit is not None
+    fit: Any = fit_navigation(records, poses, BODY_FROM_CAM, DATUM, levelled, known_scale=1.0)
     return fit.bends
 
 
@@ -554,8 +549,7 @@ def with_mount(words: str, seed: int) -> tuple[PlacementFit, RigidTransform, Arr
         )
 
     alone = {"cam": RigidTransform.identity()}
-    fit = fit_with_mount(records, poses, alone, navigate, USUAL_INSTALLATION)
-    assert fit is not None
+    fit: Any = fit_with_mount(records, poses, alone, navigate, USUAL_INSTALLATION)
     return fit, mount, np.roll(errors_of(fit, truth, poses), 3)
 
 
@@ -564,7 +558,6 @@ def test_the_mount_is_found_within_its_sigmas(words: str) -> None:
     turns, arms, places = [], [], []
     for seed in range(6):
         fit, true, error = with_mount(words, seed)
-        assert fit.mount is not None
         off = (true.rotation * fit.mount.body_from_rig.rotation.inv()).as_rotvec(degrees=True)
         assert np.abs(off).max() < 2.0
         turns.append(off / fit.mount.turn_sigma_deg)
