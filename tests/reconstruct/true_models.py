@@ -8,13 +8,16 @@ import pycolmap
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.core.frames import Array
+from alice_survey.core.records import RangeRecord
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.refraction import refract
+from reconstruct.placing.alignment import align_rigid
 from reconstruct.views.model_files import as_transform, colmap_pinhole, rigid3d
 from tests.reconstruct.scenes import Scene
 
+DISTANCES = RangeRecord(near_m=1.75, far_m=2.35, source="test")
 POSE_ERROR = (2e-3, 5e-3)
 """Sigmas of rotations, rad, and positions, m, from which models start."""
 
@@ -34,6 +37,16 @@ def warped_scene(
         warps=warps,
     )
     return seen, warps
+
+
+def started(
+    scene: Scene,
+    rng: int | np.random.Generator = 1,
+    error: tuple[float, float] = POSE_ERROR,
+) -> tuple[Mapped, Observations]:
+    """A model that starts near the truth, and what its pinholes see."""
+    seen, warps = warped_scene(scene)
+    return near_truth(scene, seen, warps, np.random.default_rng(rng), error), seen
 
 
 def near_truth(
@@ -90,8 +103,7 @@ def refracted(
     scene: Scene, folder: Path, rng: int | np.random.Generator = 1
 ) -> tuple[Mapped, Observations]:
     """A model that starts near the truth, adjusted to exact rays, and what its pinholes see."""
-    seen, warps = warped_scene(scene)
-    start = near_truth(scene, seen, warps, np.random.default_rng(rng))
+    start, seen = started(scene, rng)
     return refract(start, seen, folder)[0], seen
 
 
@@ -151,14 +163,30 @@ def model_baseline_of(pinhole_from_rig: Mapping[str, RigidTransform]) -> float:
     return float(np.linalg.norm((second * first.inv()).translation))
 
 
-def pupils_and_points(mapped: Mapped, scene: Scene) -> tuple[Array, Array, Array, Array]:
-    """Entrance pupils found and true, (N, 3), and points found and true, (P, 3)."""
+def pupils(mapped: Mapped, scene: Scene) -> tuple[Array, Array]:
+    """Entrance pupils found and true, (N, 3), of the pictures that have a pose."""
     found, true = [], []
     for number, image in sorted(mapped.model.images.items()):
-        warp = mapped.warps[scene.records[number - 1].camera]
-        pose = as_transform(image.cam_from_world()).inv() * warp.pinhole_from_cam
-        found.append(pose.translation)
-        true.append(scene.ned_from_cam[number - 1].translation)
+        if image.has_pose:
+            warp = mapped.warps[scene.records[number - 1].camera]
+            pose = as_transform(image.cam_from_world()).inv() * warp.pinhole_from_cam
+            found.append(pose.translation)
+            true.append(scene.ned_from_cam[number - 1].translation)
+    return np.array(found), np.array(true)
+
+
+def points_of(mapped: Mapped, scene: Scene) -> tuple[Array, Array]:
+    """Points found and true, (P, 3), of a model that numbers them as `near_truth` does."""
     ids = sorted(mapped.model.points3D)
     points = np.array([mapped.model.points3D[i].xyz for i in ids])
-    return np.array(found), np.array(true), points, scene.points_ned[np.array(ids) - 1]
+    return points, scene.points_ned[np.array(ids) - 1]
+
+
+def pupils_and_points(mapped: Mapped, scene: Scene) -> tuple[Array, Array, Array, Array]:
+    """Entrance pupils found and true, (N, 3), and points found and true, (P, 3)."""
+    return *pupils(mapped, scene), *points_of(mapped, scene)
+
+
+def rigid_rms(found: Array, true: Array) -> float:
+    """What is left of errors when places, (N, 3), are laid onto the true ones."""
+    return float(np.sqrt(((align_rigid(found, true).apply(found) - true) ** 2).sum(axis=1).mean()))

@@ -1,7 +1,8 @@
 """What a survey says of its own rig, against the truth."""
 
+from collections.abc import Mapping
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,6 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.config import ReconstructConfig
 from alice_survey.core.errors import ReconstructionError
-from alice_survey.core.frames import Array
-from alice_survey.core.records import RangeRecord
 from camera_calib.freedom import POSE, knowing_water, value
 from camera_calib.rig import Covariance, Rig
 from reconstruct.adjustment import exact_observations, survey_fit
@@ -39,17 +38,15 @@ from reconstruct.adjustment.survey_fit import (
 )
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped, model_baseline
-from reconstruct.placing.alignment import align_rigid, align_similarity
-from tests.cameras import changed
+from reconstruct.placing.alignment import align_similarity
 from tests.engines import PicklingThreads
 from tests.reconstruct.rig_survey import four_cameras
 from tests.reconstruct.scenes import Scene, make_scene
-from tests.reconstruct.true_models import pupils_and_points, refracted
+from tests.reconstruct.true_models import DISTANCES, points_of, pupils, refracted, rigid_rms
 
 NOISE_PX = 0.3
 TURN_SIGMA = 3e-4
 PORT = ReconstructConfig(refine_port=True, refine_rig="off")
-DISTANCES = RangeRecord(near_m=1.75, far_m=2.35, source="test")
 
 
 @cache
@@ -67,13 +64,22 @@ def modelled(scene: Scene, rig: Rig, folder: Path) -> tuple[Mapped, Observations
     return refracted(replace(scene, rig=rig), folder)
 
 
-def nearer(rig: Rig, by_m: float) -> Rig:
+def with_sigmas(rig: Rig, sigmas: Mapping[str, float]) -> Rig:
+    matrix = np.diag(np.array([*sigmas.values()]) ** 2)
+    return replace(rig, covariance=Covariance(parameters=tuple(sigmas), matrix=matrix))
+
+
+def with_camera(rig: Rig, name: str, **changes: float) -> Rig:
+    camera = rig.cameras[name].with_parameters(changes)
+    return replace(rig, cameras={**rig.cameras, name: camera})
+
+
+def nearer(rig: Rig, by_m: float, **changes: float) -> Rig:
     """The same with shorter ports."""
-    cameras = {
-        name: changed(c, port_distance_m=c.parameter("port_distance_m") - by_m)
-        for name, c in rig.cameras.items()
-    }
-    return replace(rig, cameras=cameras)
+    for name, camera in rig.cameras.items():
+        port_m = camera.parameter("port_distance_m") - by_m
+        rig = with_camera(rig, name, port_distance_m=port_m, **changes)
+    return rig
 
 
 def right_turned(rig: Rig, turn_rad: float, sigmas: list[float]) -> Rig:
@@ -81,12 +87,8 @@ def right_turned(rig: Rig, turn_rad: float, sigmas: list[float]) -> Rig:
     pose = rig.cam_from_rig["right"]
     turned = Rotation.from_rotvec([0.0, turn_rad, 0.0]) * pose.rotation
     right = RigidTransform.from_components(pose.translation, turned)
-    names = tuple(f"right.{name}" for name in POSE)
-    return replace(
-        rig,
-        covariance=Covariance(parameters=names, matrix=np.diag(sigmas) ** 2),
-        cam_from_rig={**rig.cam_from_rig, "right": right},
-    )
+    known = {f"right.{name}": sigma for name, sigma in zip(POSE, sigmas, strict=True)}
+    return replace(with_sigmas(rig, known), cam_from_rig={**rig.cam_from_rig, "right": right})
 
 
 def errors_in_sigmas(fit: SurveyFit, true: Rig) -> np.ndarray:
@@ -113,54 +115,33 @@ def test_a_wrong_port_comes_back_within_its_sigmas(tmp_path: Path) -> None:
 
 
 def test_without_noise_port_water_and_rig_are_found_exactly(tmp_path: Path) -> None:
-    wrong = nearer(clean().rig, 0.003)
-    wrong = replace(
-        wrong,
-        cameras={
-            name: c.with_parameters({"n_water": 1.342, "normal_x": 0.004})
-            for name, c in wrong.cameras.items()
-        },
-    )
+    wrong = nearer(clean().rig, 0.003, n_water=1.342, normal_x=0.004)
     mapped, seen = modelled(clean(), wrong, tmp_path)
     fit = fit_survey(mapped, seen, wrong, port=True, pose=False)
     for name in fit.parameters:
         # The wide prior still pulls a little; it is worth a tiny part of the sigma.
-        sigma = fit.rig.sigmas[name]
-        assert value(fit.rig, name) == pytest.approx(
-            value(clean().rig, name), abs=0.2 * sigma + 1e-9
-        )
+        off = abs(value(fit.rig, name) - value(clean().rig, name))
+        assert off < 0.2 * fit.rig.sigmas[name] + 1e-9
     assert fit.sigma_px < 0.02
 
 
 def test_calibrated_parameters_move_within_their_covariance(tmp_path: Path) -> None:
     """A principal point that calibration had wrong by one sigma is not blamed on the rig."""
     scene = noisy(4)
-    names = ("right.cx_px", "right.rx_rad", "right.ry_rad", "right.rz_rad")
-    covariance = np.diag(np.array([1.0, TURN_SIGMA, TURN_SIGMA, TURN_SIGMA]) ** 2)
-    right = scene.rig.cameras["right"]
-    wrong = replace(
-        scene.rig,
-        cameras={**scene.rig.cameras, "right": changed(right, cx_px=right.cx_px + 1.0)},
-        covariance=Covariance(parameters=names, matrix=covariance),
-    )
+    known = {"right.cx_px": 1.0} | {f"right.r{axis}_rad": TURN_SIGMA for axis in "xyz"}
+    wrong = with_camera(scene.rig, "right", cx_px=scene.rig.cameras["right"].cx_px + 1.0)
+    wrong = with_sigmas(wrong, known)
     mapped, seen = modelled(scene, wrong, tmp_path)
     fit = fit_survey(mapped, seen, wrong, port=False, pose=True)
-    assert set(names) <= set(fit.parameters)
-    np.testing.assert_allclose(
-        [fit.prior_sigmas[fit.parameters.index(n)] for n in names], np.sqrt(np.diag(covariance))
-    )
-    assert np.all(
-        [fit.rig.sigmas[n] <= 1.0001 * np.sqrt(covariance[i, i]) for i, n in enumerate(names)]
-    )
-    shared = [fit.parameters.index(n) for n in names]
+    assert known.keys() <= set(fit.parameters)
+    shared = [fit.parameters.index(n) for n in known]
+    np.testing.assert_allclose(fit.prior_sigmas[shared], [*known.values()])
+    assert all(fit.rig.sigmas[n] <= 1.0001 * sigma for n, sigma in known.items())
     assert np.abs(errors_in_sigmas(fit, scene.rig)[shared]).max() < 4.0
 
 
 def points_rms(mapped: Mapped, scene: Scene) -> float:
-    """Of the points, wherever the model lies."""
-    _, _, points, true = pupils_and_points(mapped, scene)
-    away = align_rigid(points, true).apply(points) - true
-    return float(np.sqrt((away**2).sum(axis=1).mean()))
+    return rigid_rms(*points_of(mapped, scene))
 
 
 def test_the_model_is_built_again_on_the_refined_rig(tmp_path: Path) -> None:
@@ -168,9 +149,8 @@ def test_the_model_is_built_again_on_the_refined_rig(tmp_path: Path) -> None:
     wrong = nearer(scene.rig, 0.01)
     mapped, _ = modelled(scene, wrong, tmp_path)
     found = adjust_survey(mapped, scene.records, wrong, DISTANCES, PORT)
-    assert found.exact is not None and found.rig is not None and found.shape is not None
     fit, refined = found.exact.fit, found.mapped
-    assert found.rig.covariance is not None
+    assert found.rig.covariance is not None and found.shape is not None
     assert refined.baseline == pytest.approx(model_baseline(refined.model), rel=1e-9)
     said = fit.record.to_json()
     assert said["parameters"][0] == "left.port_distance_m"
@@ -230,7 +210,7 @@ def test_a_calibration_with_sigmas_lets_the_survey_refine_the_rig(tmp_path: Path
 
     assert points_rms(refined(wrong).mapped, scene) < 0.5 * points_rms(mapped, scene)
     held = refined(wrong, refine_rig="off")
-    assert held.rig == wrong and held.shape is not None
+    assert held.rig == wrong
     assert held.shape.modes.calibration.shape[0] == 0, "then no mode moves the rig"
     both, unknown = ["left", "right"], replace(wrong, covariance=None)
     assert frees_poses(ReconstructConfig(), wrong, both)
@@ -257,7 +237,6 @@ def test_a_large_survey_is_adjusted_in_parts_as_a_whole(
     whole = fit_survey(mapped, seen, wrong, port=False, pose=True)
     monkeypatch.setattr(exact_observations, "PART", -(-whole.observations // 7))
     parts = fit_survey(mapped, seen, wrong, port=False, pose=True)
-    assert whole.calibration is not None and parts.calibration is not None
     assert whole.observations == parts.observations
     away, same = KDTree(whole.calibration.places).query(parts.calibration.places)
     assert np.max(away) < 1e-6
@@ -277,20 +256,17 @@ def test_a_large_survey_is_adjusted_in_parts_as_a_whole(
             )  # fmt: skip
         assert engine.tasks > 3 * 7
         assert len(list(folder.iterdir())) == 7
-        assert again.calibration is not None
         np.testing.assert_array_equal(again.after, parts.after)
         np.testing.assert_array_equal(again.state.points, parts.state.points)
         np.testing.assert_array_equal(again.calibration.points, parts.calibration.points)
     monkeypatch.setattr(survey_fit, "_MAX_PLACES", len(whole.point_ids) // 3)
-    some = fit_survey(mapped, seen, wrong, port=False, pose=True).calibration
-    assert some is not None
+    some: Any = fit_survey(mapped, seen, wrong, port=False, pose=True).calibration
     assert 0.2 < len(some.places) / len(whole.point_ids) < 0.35
     every = round(len(whole.point_ids) / len(some.places))
     np.testing.assert_array_equal(some.points, parts.calibration.points[::every])
     np.testing.assert_array_equal(some.places, parts.calibration.places[::every])
 
 
-INDEX_DISTANCES = RangeRecord(near_m=1.75, far_m=2.35, source="test")
 POSES = {"right.rx_rad": 2e-5, "right.ry_rad": 2e-5, "right.rz_rad": 2e-5,
          "right.x_m": 2e-6, "right.y_m": 2e-6, "right.z_m": 2e-6}  # fmt: skip
 SIGMA = 1e-3
@@ -299,12 +275,7 @@ SIGMA = 1e-3
 def believing(scene: Scene, believed: Rig, folder: Path) -> AdjustedSurvey:
     """The survey as believing by who believes in a rig."""
     mapped, _ = modelled(scene, believed, folder)
-    return adjust_survey(mapped, scene.records, believed, INDEX_DISTANCES, ReconstructConfig())
-
-
-def with_poses(rig: Rig) -> Rig:
-    matrix = np.diag(np.array(list(POSES.values())) ** 2)
-    return replace(rig, covariance=Covariance(parameters=tuple(POSES), matrix=matrix))
+    return adjust_survey(mapped, scene.records, believed, DISTANCES, ReconstructConfig())
 
 
 def test_ranges_of_one_pair_follow_the_index_as_snells_law_says(tmp_path: Path) -> None:
@@ -320,8 +291,7 @@ def test_ranges_of_one_pair_follow_the_index_as_snells_law_says(tmp_path: Path) 
     )  # fmt: skip
     rig = knowing_water(scene.rig, SIGMA)
     mapped, seen = refracted(scene, tmp_path)
-    moved = fit_survey(mapped, seen, rig, port=False, pose=False).calibration
-    assert moved is not None
+    moved: Any = fit_survey(mapped, seen, rig, port=False, pose=False).calibration
     ned_from_cam = scene.ned_from_cam[0]
     places = ned_from_cam.inv().apply(moved.places)
     ways = ned_from_cam.rotation.inv().apply(moved.points.sum(axis=2))
@@ -342,30 +312,21 @@ def test_ranges_of_one_pair_follow_the_index_as_snells_law_says(tmp_path: Path) 
 
 def scale_error_and_sigma(found: AdjustedSurvey, scene: Scene) -> tuple[float, float]:
     """Of the stations' scale, relative."""
-    assert found.shape is not None
-    pupils, true, _, _ = pupils_and_points(found.mapped, scene)
-    error = 1.0 / align_similarity(pupils, true).scale - 1.0
-    stations = centres_of(found)
+    error = 1.0 / align_similarity(*pupils(found.mapped, scene)).scale - 1.0
+    stations = found.exact.fit.state.centres
     arms = stations - stations.mean(axis=0)
     weights = arms / (arms**2).sum()
     by_mode = np.einsum("fi,fik->k", weights, found.shape.modes.stations[:, 3:])
     return error, float(np.linalg.norm(by_mode))
 
 
-def centres_of(found: AdjustedSurvey) -> Array:
-    assert found.exact is not None
-    return found.exact.fit.state.centres
-
-
 def test_scales_lie_within_their_sigmas_where_the_index_is_drawn(tmp_path: Path) -> None:
     drawn, counted, ignored = np.random.default_rng(4).normal(0, SIGMA, 12), [], []
     for seed, off in enumerate(drawn):
-        truth = make_scene(lines=2, stations=5, points=600, noise_px=0.05, scale=2, seed=seed)
-        believed = with_poses(truth.rig)
-        scene = make_scene(
-            lines=2, stations=5, points=600, noise_px=0.05, scale=2, seed=seed,
-            rig=truth.rig.in_water(truth.rig.cameras["left"].n_water + off),
-        )  # fmt: skip
+        survey = partial(make_scene, lines=2, stations=5, points=600, noise_px=0.05, seed=seed)
+        truth = survey(scale=2).rig
+        scene = survey(rig=truth.in_water(truth.cameras["left"].n_water + off))
+        believed = with_sigmas(truth, POSES)
         for rig, ratios in ((knowing_water(believed, SIGMA), counted), (believed, ignored)):
             error, sigma = scale_error_and_sigma(believing(scene, rig, tmp_path), scene)
             ratios.append(error / sigma)
@@ -440,24 +401,10 @@ def test_a_wrong_parameter_is_found_and_named():
 
 def test_nothing_free_contradicts_nothing():
     assert contradiction((), np.empty(0), np.empty((0, 0)), np.empty((0, 0))) is None
-    still = contradiction(NAMES, np.zeros(6), np.eye(6), np.eye(6))
-    assert still is None
+    assert contradiction(NAMES, np.zeros(6), np.eye(6), np.eye(6)) is None
 
 
 STATED = {"port_distance_m": 5e-5, "normal_x": 2e-4, "normal_y": 2e-4, "n_water": 2e-4}
-
-
-def believed(rig: Rig, wrong: dict[str, float]) -> Rig:
-    """The rig with parameters of its left camera off, and all of its ports stated as `STATED`."""
-    left = rig.cameras["left"]
-    off = {name: left.parameter(name) + by for name, by in wrong.items()}
-    names = tuple(f"{camera}.{field}" for camera in rig.cameras for field in STATED)
-    sigmas = np.array([STATED[name.split(".")[1]] for name in names])
-    return replace(
-        rig,
-        cameras={**rig.cameras, "left": left.with_parameters(off)},
-        covariance=Covariance(parameters=names, matrix=np.diag(sigmas**2)),
-    )
 
 
 @pytest.mark.parametrize(
@@ -468,7 +415,10 @@ def test_a_port_stated_too_well_is_named_and_a_right_one_is_not(
     tmp_path: Path, wrong: dict[str, float], about: str | None
 ):
     scene = noisy(5)
-    rig = believed(scene.rig, wrong)
+    left = scene.rig.cameras["left"]
+    off = {name: left.parameter(name) + by for name, by in wrong.items()}
+    stated = {f"{name}.{field}": s for name in scene.rig.cameras for field, s in STATED.items()}
+    rig = with_sigmas(with_camera(scene.rig, "left", **off), stated)
     mapped, seen = modelled(scene, rig, tmp_path)
     found = fit_survey(mapped, seen, rig, port=True, pose=False).contradiction
     assert (found is None) == (about is None)

@@ -15,9 +15,9 @@ from alice_survey.core.block_solver import BlockStep
 from alice_survey.core.config import ReconstructConfig
 from alice_survey.core.errors import WorkspaceError
 from alice_survey.core.frames import Array
-from alice_survey.core.records import RangeRecord
 from benchmarks.bend_pipeline import Adjusted, adjusted
-from camera_calib.rig import Covariance, Rig
+from camera_calib.freedom import POSE
+from camera_calib.rig import Rig
 from reconstruct.adjustment import exact_observations
 from reconstruct.adjustment.exact_observations import Workers, exact_survey
 from reconstruct.adjustment.exact_observations import exact_observations as linearised
@@ -34,7 +34,6 @@ from reconstruct.adjustment.uncertainty import (
 )
 from reconstruct.mapping.arrays import cross_matrices, frames_of, observations
 from reconstruct.mapping.bundle import cauchy_weights
-from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.refraction import adjust_freely
 from reconstruct.placing.alignment import align_rigid, align_similarity, level
@@ -44,8 +43,16 @@ from reconstruct.placing.track import picture_modes
 from reconstruct.views.model_files import as_transform
 from tests.engines import PicklingThreads
 from tests.oracles_refraction import dense_normal_equations, dense_of, laid_onto
+from tests.reconstruct.adjustment.test_survey_fit import with_sigmas
 from tests.reconstruct.scenes import DATUM, Scene, make_scene, stating
-from tests.reconstruct.true_models import near_truth, refracted, true_stations, warped_scene
+from tests.reconstruct.true_models import (
+    DISTANCES,
+    refracted,
+    rigid_rms,
+    started,
+    true_stations,
+    warped_scene,
+)
 
 NOISE_PX = 0.3
 
@@ -68,9 +75,7 @@ def test_errors_are_as_large_as_stated(tmp_path: Path) -> None:
     for seed in range(12):
         scene, mapped = drawn(seed, tmp_path)
         found = estimate(mapped, scene.records)
-        misses, point_misses = laid_onto(
-            mapped.model, found, true_stations(scene, mapped), scene.points_ned, _depth(mapped)
-        )
+        misses, point_misses = _away(mapped, found, scene)
         frames.append(misses / _sigmas(found.frame_cov))
         points.append(point_misses / _sigmas(found.point_cov))
         assert found.sigma_px == pytest.approx(NOISE_PX, rel=0.12)
@@ -135,9 +140,11 @@ def _observations(mapped: Mapped) -> LinearObservations:
     return linearised(state, pixels, ())
 
 
-def _depth(mapped: Mapped) -> float:
-    """The usual one, which weighs turns against positions."""
-    return float(np.median(np.linalg.norm(_observations(mapped).arm, axis=1)))
+def _away(mapped: Mapped, found: Uncertainty, scene: Scene) -> tuple[Array, Array]:
+    """Errors of stations and points; the usual depth weighs turns against positions."""
+    depth_m = float(np.median(np.linalg.norm(_observations(mapped).arm, axis=1)))
+    true = true_stations(scene, mapped)
+    return laid_onto(mapped.model, found, true, scene.points_ned, depth_m)
 
 
 def _few(linear: LinearObservations, points: int, rng: np.random.Generator) -> LinearObservations:
@@ -171,8 +178,7 @@ SIGMAS = {
 @cache
 def calibrated() -> Scene:
     found = make_scene(lines=2, stations=5, points=900, scale=1, relief_m=0.3)
-    known = Covariance(parameters=tuple(SIGMAS), matrix=np.diag([s**2 for s in SIGMAS.values()]))
-    return replace(found, rig=replace(found.rig, covariance=known))
+    return replace(found, rig=with_sigmas(found.rig, SIGMAS))
 
 
 def noisy(seed: int = 0) -> Scene:
@@ -187,14 +193,12 @@ def off(rig: Rig, steps: dict[str, float]) -> Rig:
     cameras, poses = dict(rig.cameras), dict(rig.cam_from_rig)
     for name, step in steps.items():
         camera, field = name.split(".")
-        if field.endswith("_rad"):
-            turn = Rotation.from_rotvec(step * np.eye(3)["xyz".index(field[1])])
-            pose = poses[camera]
-            poses[camera] = type(pose).from_components(pose.translation, turn * pose.rotation)
-        elif field in ("x_m", "y_m", "z_m"):
-            pose = poses[camera]
-            moved = pose.translation + step * np.eye(3)["xyz".index(field[0])]
-            poses[camera] = type(pose).from_components(moved, pose.rotation)
+        if field in POSE:
+            turn, shift = step * np.eye(6)[POSE.index(field)].reshape(2, 3)
+            pose, turned = poses[camera], Rotation.from_rotvec(turn)
+            poses[camera] = RigidTransform.from_components(
+                pose.translation + shift, turned * pose.rotation
+            )
         else:
             now = cameras[camera]
             cameras[camera] = now.with_parameters({field: now.parameter(field) + step})
@@ -207,9 +211,10 @@ def points_with(rig: Rig, folder: Path, seed: int = 0) -> tuple[Mapped, Array]:
     return mapped, observations(mapped.model).points
 
 
-def part_of(mapped: Mapped, seen: Observations, rig: Rig) -> Motions | None:
+def part_of(mapped: Mapped, scene: Scene) -> Any:
     """What errors of a rig that is held do."""
-    return fit_survey(mapped, seen, rig, port=False, pose=False).calibration
+    seen, _ = warped_scene(scene)
+    return fit_survey(mapped, seen, scene.rig, port=False, pose=False).calibration
 
 
 def shape_of(points: Array, true: Array) -> Array:
@@ -219,8 +224,7 @@ def shape_of(points: Array, true: Array) -> Array:
 @pytest.mark.parametrize("name", SIGMAS)
 def test_a_wrong_parameter_moves_the_points_as_predicted(name: str, tmp_path: Path) -> None:
     mapped, true = points_with(noisy().rig, tmp_path)
-    part = part_of(mapped, warped_scene(noisy())[0], noisy().rig)
-    assert part is not None
+    part = part_of(mapped, noisy())
     step = SIGMAS[name]
     _, found = points_with(off(noisy().rig, {name: step}), tmp_path)
     expected = part.points[:, :, list(SIGMAS).index(name)] * step
@@ -234,22 +238,14 @@ def test_with_random_errors_of_calibration_the_block_is_as_good_as_stated(tmp_pa
     stations, points, too_sure, apart = [], [], [], []
     for seed in range(12):
         steps = {name: float(s * rng.normal()) for name, s in SIGMAS.items()}
-        rig = off(noisy().rig, steps)
-        mapped, _ = points_with(rig, tmp_path, seed)
-        seen = warped_scene(replace(noisy(seed), rig=rig))[0]
-        part = part_of(mapped, seen, rig)
-        found = estimate(mapped, seen.images, part)
-        away = laid_onto(
-            mapped.model,
-            found,
-            true_stations(noisy(), mapped),
-            noisy().points_ned,
-            _depth(mapped),
-        )
+        scene = replace(noisy(seed), rig=off(noisy().rig, steps))
+        mapped, _ = points_with(scene.rig, tmp_path, seed)
+        found = estimate(mapped, scene.records, part_of(mapped, scene))
+        away = _away(mapped, found, noisy())
         stations.append(away[0] / _sigmas(found.frame_cov))
         points.append(away[1] / _sigmas(found.point_cov))
         apart.append(_relative_misses(found, away[1], mapped, rng))
-        without = estimate(mapped, seen.images)
+        without = estimate(mapped, scene.records)
         too_sure.append(away[1] / _sigmas(without.point_cov))
     for ratios in (stations, points, apart):
         assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.4
@@ -281,8 +277,7 @@ def test_a_station_that_sees_next_to_nothing_stays(tmp_path: Path) -> None:
         p.point3D_id for n in lonely for p in mapped.model.images[n].get_observation_points2D()
     }:
         mapped.model.delete_point3D(point)
-    part = part_of(mapped, warped_scene(noisy())[0], noisy().rig)
-    assert part is not None
+    part = part_of(mapped, noisy())
     assert np.isfinite(part.stations).all()
     assert np.all(part.stations[4] == 0)
     assert np.all(np.abs(np.delete(part.stations, [0, 4], axis=0)).max(axis=(1, 2)) > 0)
@@ -292,10 +287,8 @@ def _relative_misses(
     found: Uncertainty, misses: Array, mapped: Mapped, rng: np.random.Generator
 ) -> Array:
     """Errors of one point relative to another over what shared motions and own noise say."""
-    shared = found.shared
-    assert shared is not None
-    points = np.array([mapped.model.points3D[int(n)].xyz for n in found.point_ids])
-    rows = np.asarray(KDTree(points).query(shared.places)[1])
+    shared, places = found.shared, observations(mapped.model).points
+    rows = np.asarray(KDTree(places).query(shared.places)[1])
     i, j = rng.permutation(len(rows))[:200].reshape(2, 100)
     motion = shared.motions[i] - shared.motions[j]
     noise = found.point_noise[rows[i]] + found.point_noise[rows[j]]
@@ -305,20 +298,17 @@ def _relative_misses(
 
 
 def test_what_points_share_is_nearly_all_that_poses_do(tmp_path: Path) -> None:
-    mapped, _ = points_with(noisy().rig, tmp_path)
-    part = part_of(mapped, warped_scene(noisy())[0], noisy().rig)
+    mapped, places = points_with(noisy().rig, tmp_path)
+    part = part_of(mapped, noisy())
     shares = []
     for calibration in (None, part):
         found = estimate(mapped, noisy().records, calibration)
         write_uncertainty(tmp_path / "a.npz", found)
-        shared = read_uncertainty(tmp_path / "a.npz").shared
-        assert shared is not None
-        points = np.array([mapped.model.points3D[int(n)].xyz for n in found.point_ids])
-        away, rows = KDTree(points).query(shared.places)
+        shared: Any = read_uncertainty(tmp_path / "a.npz").shared
+        away, rows = KDTree(places).query(shared.places)
         assert np.max(away) == 0.0
         pose = np.trace((found.point_cov - found.point_noise)[rows], axis1=1, axis2=2)
-        seen = np.trace(spread(shared.motions, shared.covariance), axis1=1, axis2=2)
-        share = seen / pose
+        share = np.trace(spread(shared.motions, shared.covariance), axis1=1, axis2=2) / pose
         assert share.max() < 1.1
         shares.append(float(np.median(share)))
     assert 0.6 < shares[0] < 1.001, shares
@@ -329,7 +319,7 @@ def test_parts_of_a_large_survey_know_what_the_whole_knows(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     mapped, _ = points_with(noisy().rig, tmp_path)
-    records, part = noisy().records, part_of(mapped, warped_scene(noisy())[0], noisy().rig)
+    records, part = noisy().records, part_of(mapped, noisy())
     count = mapped.model.compute_num_observations()
     whole = estimate(mapped, records, part)
     monkeypatch.setattr(exact_observations, "PART", -(-count // 6))
@@ -360,16 +350,13 @@ def test_parts_of_a_large_survey_know_what_the_whole_knows(
 
 RIG_SIGMAS = {"right.ry_rad": 1e-4, "right.rx_rad": 1e-4, "left.k1": 2e-4, "right.z_m": 1e-4,
           "right.rz_rad": 1e-4, "right.x_m": 1e-5, "right.y_m": 1e-5}  # fmt: skip
-DISTANCES = RangeRecord(near_m=1.75, far_m=2.35, source="test")
 
 
 @cache
 def on_known_rig() -> Scene:
     """Two short lines on a rig whose covariance is known."""
     scene = make_scene(lines=2, stations=5, points=500, noise_px=0.3, scale=1, relief_m=0.3)
-    matrix = np.diag(np.array(list(RIG_SIGMAS.values())) ** 2)
-    known = Covariance(parameters=tuple(RIG_SIGMAS), matrix=matrix)
-    return replace(scene, rig=replace(scene.rig, covariance=known))
+    return replace(scene, rig=with_sigmas(scene.rig, RIG_SIGMAS))
 
 
 @pytest.fixture(scope="module")
@@ -381,7 +368,6 @@ def survey(tmp_path_factory: pytest.TempPathFactory) -> AdjustedSurvey:
 
 def hessian_of(survey: AdjustedSurvey) -> Array:
     """Of stations, points and rig, in that order, priors included: no elimination, no modes."""
-    assert survey.exact is not None
     fit = survey.exact.fit
     pixels = exact_survey(survey.exact.mapped, survey.exact.seen, fit.calibrated)[0]
     linear = linearised(fit.state, pixels, fit.parameters)
@@ -397,7 +383,6 @@ def hessian_of(survey: AdjustedSurvey) -> Array:
 
 def test_modes_and_navigation_end_where_all_unknowns_at_once_do(survey: AdjustedSurvey) -> None:
     """Readings of the stations' places, bent by 4 mm: solved for some 1,500 unknowns, densely."""
-    assert survey.exact is not None and survey.shape is not None
     state, modes = survey.exact.fit.state, survey.shape.modes
     count, rng = len(state.centres), np.random.default_rng(3)
     away = state.centres - state.centres.mean(axis=0)
@@ -458,18 +443,14 @@ def mute(scene: Scene) -> Scene:
 
 
 def flown(scene: Scene, folder: Path) -> Adjusted:
-    seen, warps = warped_scene(scene)
-    start = near_truth(scene, seen, warps, np.random.default_rng(1))
+    start, seen = started(scene)
     return adjusted(start, seen, scene.rig, DISTANCES, DATUM, folder)
 
 
 def rms_and_scale(found: Adjusted, scene: Scene) -> tuple[float, float]:
-    true = RigidTransform.concatenate(
-        [p for p, r in zip(scene.ned_from_cam, scene.records, strict=True) if r.camera == "left"]
-    ).translation
+    true = RigidTransform.concatenate(scene.left.ned_from_cam).translation
     at = found.ned_from_cam.translation
-    off = align_rigid(at, true).apply(at) - true
-    return float(np.sqrt((off**2).sum(axis=1).mean())), align_similarity(at, true).scale - 1.0
+    return rigid_rms(at, true), align_similarity(at, true).scale - 1.0
 
 
 @pytest.mark.parametrize("jump_m", [0.0, 8.0])
@@ -507,30 +488,26 @@ def test_one_camera_takes_scale_and_shape_from_navigation() -> None:
 
 def placed_alone(scene: Scene, rng: np.random.Generator) -> tuple[float, float, float, float]:
     """Error and sigma of the scale; median of cameras after a similarity, before and with modes."""
-    seen, warps = warped_scene(scene)
-    start = near_truth(scene, seen, warps, rng)
+    start, _ = started(scene, rng)
     mapped = adjust_freely(replace(start, scaled=False, baseline=np.nan))
     model = pycolmap.Reconstruction(mapped.model)
     model.transform(pycolmap.Sim3d(1.0 / 0.37, pycolmap.Rotation3d(), np.zeros(3)))
     found = adjust_survey(
         replace(mapped, model=model), scene.records, scene.rig, None, ReconstructConfig()
     )
-    assert found.exact is None and found.shape is not None
+    assert found.exact is None
     pinholes = [
         as_transform(found.mapped.model.images[n].cam_from_world()).inv()
         for n in sorted(found.mapped.model.images)
     ]
     points = np.array([p.xyz for p in found.mapped.model.points3D.values()])
-    fit = fit_navigation(
-        scene.records, pinholes, body_from_pinhole(scene.rig, warps), DATUM,
+    fit: Any = fit_navigation(
+        scene.records, pinholes, body_from_pinhole(scene.rig, start.warps), DATUM,
         level(points, np.array([p.translation for p in pinholes])), known_scale=None,
         modes=picture_modes(found.shape, scene.records, pinholes),
     )  # fmt: skip
-    assert fit is not None
     after = found.deform(fit.modes, fit.joint[PLACE:, PLACE:]).mapped.model
-    true = np.array([
-        (pose * warps["left"].pinhole_from_cam.inv()).translation for pose in scene.ned_from_cam
-    ])  # fmt: skip
+    true = np.array([pose.translation for pose in true_stations(scene, start)])
     rms, aligned = [], []
     for one in (found.mapped.model, after):
         at = np.array([one.images[n].projection_center() for n in sorted(one.images)])

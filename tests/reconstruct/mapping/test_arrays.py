@@ -9,8 +9,7 @@ from tests.reconstruct.mapping.test_mapper import block_mapped
 
 def test_observations_are_those_of_the_model() -> None:
     model = pycolmap.Reconstruction(block_mapped().model)
-    lost = max(model.reg_frame_ids())
-    model.deregister_frame(lost)
+    model.deregister_frame(max(model.reg_frame_ids()))
     seen = observations(model)
     posed = sorted(n for n, image in model.images.items() if image.has_pose)
     assert seen.pictures.tolist() == posed and len(posed) < model.num_images()
@@ -48,9 +47,3 @@ def test_groups_are_the_stations_that_points_link() -> None:
         assert np.all(np.diff(counts) <= 0)
         assert not group[~seen].any()
         assert first_of(group).tolist() == [group.tolist().index(g) for g in range(len(counts))]
-
-
-def test_a_station_that_sees_too_little_links_nothing() -> None:
-    station = np.array([0] * 5 + [1] * 2 + [2] * 5)
-    point = np.array([0, 1, 2, 3, 4, 4, 5, 5, 6, 7, 8, 9])
-    assert linked_groups(station, point, 3).tolist() == [0, 0, 1]

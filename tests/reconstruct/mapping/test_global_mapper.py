@@ -1,14 +1,11 @@
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.executor import SERIAL, local_executor
-from camera_calib.approximation.pinhole_warp import PinholeWarp
 from reconstruct.mapping.arrays import model_groups
 from reconstruct.mapping.global_mapper import (
     StationLink,
@@ -17,14 +14,14 @@ from reconstruct.mapping.global_mapper import (
     station_groups,
     stereo_points,
 )
-from reconstruct.mapping.mapper import Mapped, map_calibrated
-from reconstruct.placing.alignment import align_rigid
-from tests.reconstruct.mapping.test_mapper import camera_rms, pupils, seen_by_pinholes
+from tests.reconstruct.mapping.test_mapper import (
+    camera_rms,
+    mapped_scene,
+    pinhole_rig,
+    seen_by_pinholes,
+)
 from tests.reconstruct.scenes import Scene, make_scene
-
-
-def pinhole_rig(scene: Scene, lenses: Mapping[str, PinholeWarp]) -> dict[str, RigidTransform]:
-    return {n: lenses[n].pinhole_from_cam * p for n, p in scene.rig.cam_from_rig.items()}
+from tests.reconstruct.true_models import pupils, rigid_rms
 
 
 def station_poses(scene: Scene) -> dict[int, RigidTransform]:
@@ -35,31 +32,22 @@ def station_poses(scene: Scene) -> dict[int, RigidTransform]:
     }
 
 
-def mapped_by(scene: Scene, threads: int = 1) -> Mapped:
-    seen, poses = seen_by_pinholes(scene), scene.rig.cam_from_rig
-    with TemporaryDirectory() as folder:
-        return map_calibrated(seen, poses, Path(folder), 1, executor=local_executor(threads))
-
-
 def ring(
     rng: np.random.Generator, noise: float = 0.0
 ) -> tuple[list[StationLink], list[RigidTransform]]:
     """Twelve stations, each linked to the next three, with exact or noisy relative poses."""
-    poses = [
-        RigidTransform.from_components(
-            rng.normal(0, 3, 3), Rotation.from_rotvec(rng.normal(0, 1.0, 3))
-        )
-        for _ in range(12)
+
+    def drawn(count: int, metres: float, turn_rad: float) -> RigidTransform:
+        turns = Rotation.from_rotvec(rng.normal(0, turn_rad, (count, 3)))
+        return RigidTransform.from_components(rng.normal(0, metres, (count, 3)), turns)
+
+    poses = [*drawn(12, 3.0, 1.0)]
+    ends = [(a, (a + step) % 12) for a in range(12) for step in (1, 2, 3)]
+    relative = [
+        error * poses[b] * poses[a].inv()
+        for (a, b), error in zip(ends, drawn(36, noise, noise), strict=True)
     ]
-    links = []
-    for a in range(12):
-        for step in (1, 2, 3):
-            b = (a + step) % 12
-            error = RigidTransform.from_components(
-                rng.normal(0, noise, 3), Rotation.from_rotvec(rng.normal(0, noise, 3))
-            )
-            links.append(linked(a, b, error * poses[b] * poses[a].inv()))
-    return links, poses
+    return [linked(*pair, pose) for pair, pose in zip(ends, relative, strict=True)], poses
 
 
 def linked(a: int, b: int, pose: RigidTransform) -> StationLink:
@@ -72,11 +60,8 @@ def linked(a: int, b: int, pose: RigidTransform) -> StationLink:
 def misses(links: list[StationLink], poses: list[RigidTransform]) -> np.ndarray:
     """Errors (rotation in rad, position) after moving both to the first station's frame."""
     found = average_poses(links)
-    rows = []
-    for k in range(1, len(poses)):
-        error = (found[k] * found[0].inv()) * (poses[k] * poses[0].inv()).inv()
-        rows.append([error.rotation.magnitude(), np.linalg.norm(error.translation)])
-    return np.array(rows)
+    errors = [found[k] * found[0].inv() * poses[0] * pose.inv() for k, pose in enumerate(poses)]
+    return np.array([[e.rotation.magnitude(), np.linalg.norm(e.translation)] for e in errors[1:]])
 
 
 def test_exact_links_give_back_exact_poses() -> None:
@@ -108,7 +93,7 @@ def test_groups_without_a_link_stay_apart() -> None:
 def test_stereo_points_lie_where_the_floor_is() -> None:
     scene = make_scene(lines=1, stations=2, points=2500)
     seen = seen_by_pinholes(scene)
-    found = stereo_points(seen, pinhole_rig(scene, seen.warps))
+    found = stereo_points(seen, pinhole_rig(scene, seen))
     poses = station_poses(scene)
     for record, points, ids in zip(scene.records, found, scene.ids, strict=True):
         known = np.isfinite(points[:, 0])
@@ -121,7 +106,7 @@ def test_stereo_points_lie_where_the_floor_is() -> None:
 def test_links_are_the_true_relative_poses() -> None:
     scene = make_scene(lines=2, stations=4, points=5000, noise_px=0.1)
     seen = seen_by_pinholes(scene)
-    links = link_stations(seen, pinhole_rig(scene, seen.warps), 1, SERIAL)
+    links = link_stations(seen, pinhole_rig(scene, seen), 1, SERIAL)
     poses = station_poses(scene)
     assert {(k.first, k.second) for k in links} | {(k.second, k.first) for k in links} >= {
         (k, k + 1) for k in range(3)
@@ -136,9 +121,9 @@ def test_links_are_the_true_relative_poses() -> None:
 
 def test_global_mapping_is_as_good_as_incremental(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = make_scene(lines=3, stations=5, points=7000, noise_px=0.3)
-    at_once = mapped_by(scene)
+    at_once = mapped_scene(scene)
     monkeypatch.setattr("reconstruct.mapping.mapper.map_globally", lambda *_: [])
-    one_by_one = mapped_by(scene)
+    one_by_one = mapped_scene(scene)
     assert at_once.models == one_by_one.models == (30,)
     assert "global" in at_once.notes[0] and "incremental" in one_by_one.notes[0]
     assert 0.2e-3 < camera_rms(at_once, scene) < 1.2 * camera_rms(one_by_one, scene)
@@ -150,28 +135,24 @@ def test_threads_do_not_change_a_byte(tmp_path: Path) -> None:
     scene = make_scene(lines=2, stations=4, points=3500, noise_px=0.3)
     for threads in (1, 2):
         (tmp_path / str(threads)).mkdir()
-        mapped_by(scene, threads).model.write_binary(tmp_path / str(threads))
+        mapped_scene(scene, local_executor(threads)).model.write_binary(tmp_path / str(threads))
     for file in sorted((tmp_path / "1").iterdir()):
         assert file.read_bytes() == (tmp_path / "2" / file.name).read_bytes()
 
 
 def test_models_that_no_match_links_are_kept_apart() -> None:
     scene = make_scene(lines=1, stations=10, points=6000, noise_px=0.2)
-    seen = seen_by_pinholes(scene)
-    halves = [record.station < 6 for record in seen.images]
-    cut = replace(seen, pairs=[p for p in seen.pairs if halves[p[0]] == halves[p[1]]])
-    with TemporaryDirectory() as folder:
-        mapped = map_calibrated(cut, scene.rig.cam_from_rig, Path(folder), 1)
+    halves = [record.station < 6 for record in scene.records]
+    kept = [pair for pair in scene.pairs if halves[pair[0]] == halves[pair[1]]]
+    mapped = mapped_scene(replace(scene, pairs=kept))
     assert mapped.models == (12, 8)
     assert not [note for note in mapped.notes if "separate model" in note]
     groups = model_groups(mapped.model)
     np.testing.assert_array_equal(groups, [0] * 6 + [1] * 4)
-    found, true = (np.array(p) for p in pupils(mapped, scene))
-    for group in (0, 1):
-        own = np.repeat(groups == group, 2)
-        off = align_rigid(found[own], true[own]).apply(found[own]) - true[own]
-        assert 0.05e-3 < np.sqrt((off**2).sum(axis=1).mean()) < 5e-3
-    spread = np.ptp(found[np.repeat(groups == 0, 2)], axis=0).max()
-    ends = [found[np.repeat(groups == group, 2), 0] for group in (0, 1)]
-    assert ends[1].min() - ends[0].max() > spread
+    found, true = pupils(mapped, scene)
+    own = [np.repeat(groups == group, 2) for group in (0, 1)]
+    for rows in own:
+        assert 0.05e-3 < rigid_rms(found[rows], true[rows]) < 5e-3
+    ends = [found[rows, 0] for rows in own]
+    assert ends[1].min() - ends[0].max() > np.ptp(found[own[0]], axis=0).max()
     assert mapped.model.compute_mean_reprojection_error() < 0.5

@@ -4,15 +4,14 @@ from functools import cache
 from itertools import combinations
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
 import pycolmap
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey.core.executor import SERIAL, Executor
 from alice_survey.core.manifest import ImageRecord
-from camera_calib.approximation.pinhole_warp import best_warp
 from reconstruct.mapping.database import Observations, write_database
 from reconstruct.mapping.mapper import (
     Mapped,
@@ -25,49 +24,30 @@ from reconstruct.mapping.mapper import (
     second_from_first,
 )
 from reconstruct.mapping.self_calibration import map_self_calibrated
-from reconstruct.placing.alignment import align_rigid, align_similarity
+from reconstruct.placing.alignment import align_similarity
 from reconstruct.placing.run import measure_doming
-from reconstruct.views.model_files import as_transform, colmap_pinhole, rigid3d
+from reconstruct.views.model_files import as_transform, rigid3d
 from tests.reconstruct.rig_survey import four_cameras
 from tests.reconstruct.scenes import Scene, make_scene, match_pictures
+from tests.reconstruct.true_models import pupils, rigid_rms, warped_scene
 
 
 def seen_by_pinholes(scene: Scene) -> Observations:
-    warps = {name: best_warp(c, 1.75, 2.35) for name, c in scene.rig.cameras.items()}
-    return Observations(
-        images=scene.records,
-        cameras={name: colmap_pinhole(warp.pinhole) for name, warp in warps.items()},
-        taken=scene.pixels,
-        pairs=scene.pairs,
-        warps=warps,
-    )
+    return replace(warped_scene(scene)[0], pairs=scene.pairs)
 
 
-def mapped_scene(scene: Scene, rig_scale: float = 1.0) -> Mapped:
-    seen = seen_by_pinholes(scene)
-    poses = {
-        name: RigidTransform.from_components(rig_scale * pose.translation, pose.rotation)
-        for name, pose in scene.rig.cam_from_rig.items()
-    }
+def pinhole_rig(scene: Scene, seen: Observations) -> dict[str, RigidTransform]:
+    return {n: seen.warps[n].pinhole_from_cam * p for n, p in scene.rig.cam_from_rig.items()}
+
+
+def mapped_scene(scene: Scene, executor: Executor = SERIAL) -> Mapped:
+    seen, poses = seen_by_pinholes(scene), scene.rig.cam_from_rig
     with TemporaryDirectory() as folder:
-        return map_calibrated(seen, poses, Path(folder), 1)
-
-
-def pupils(mapped: Mapped, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    found, true = [], []
-    for number, image in sorted(mapped.model.images.items()):
-        if image.has_pose:
-            record = scene.records[number - 1]
-            pose = as_transform(image.cam_from_world()).inv()
-            lens = mapped.warps[record.camera]
-            found.append((pose * lens.pinhole_from_cam).translation)
-            true.append(scene.ned_from_cam[number - 1].translation)
-    return np.array(found), np.array(true)
+        return map_calibrated(seen, poses, Path(folder), 1, executor=executor)
 
 
 def camera_rms(mapped: Mapped, scene: Scene) -> float:
-    found, true = pupils(mapped, scene)
-    return float(np.sqrt(((align_rigid(found, true).apply(found) - true) ** 2).sum(axis=1).mean()))
+    return rigid_rms(*pupils(mapped, scene))
 
 
 @cache
@@ -86,8 +66,7 @@ def test_without_noise_only_the_warp_is_left() -> None:
     mapped = mapped_scene(scene)
     assert mapped.models[0] == len(scene.records)
     assert camera_rms(mapped, scene) < 0.4e-3
-    found, true = pupils(mapped, scene)
-    assert align_similarity(found, true).scale == pytest.approx(1.0, abs=4e-4)
+    assert align_similarity(*pupils(mapped, scene)).scale == pytest.approx(1.0, abs=4e-4)
     assert mapped.model.compute_mean_reprojection_error() < 0.01
 
 
@@ -96,15 +75,18 @@ def test_noise_of_a_third_of_a_pixel_costs_millimetres() -> None:
     assert mapped.models[0] == len(scene.records)
     assert 0.2e-3 < camera_rms(mapped, scene) < 4e-3
     assert 0.2 < mapped.model.compute_mean_reprojection_error() < 0.4
-    found, true = pupils(mapped, scene)
-    assert abs(align_similarity(found, true).scale - 1.0) < 2e-3
+    assert abs(align_similarity(*pupils(mapped, scene)).scale - 1.0) < 2e-3
 
 
 def test_the_scale_is_that_of_the_rig() -> None:
     """A rig given twice as large gives a model twice as large: nothing else sets the scale."""
     scene = make_scene(lines=1, stations=6, points=4000, noise_px=0.1)
-    found, true = pupils(mapped_scene(scene, rig_scale=2.0), scene)
-    assert align_similarity(found, true).scale == pytest.approx(0.5, rel=5e-3)
+    twice = {
+        name: RigidTransform.from_components(2.0 * pose.translation, pose.rotation)
+        for name, pose in scene.rig.cam_from_rig.items()
+    }
+    mapped = mapped_scene(replace(scene, rig=replace(scene.rig, cam_from_rig=twice)))
+    assert align_similarity(*pupils(mapped, scene)).scale == pytest.approx(0.5, rel=5e-3)
 
 
 @pytest.mark.parametrize("names", [("wide", "tele", "bow", "side"), ("tele", "bow", "side")])
@@ -119,10 +101,8 @@ def test_any_number_of_unlike_cameras_map_to_the_same_truth(names: tuple[str, ..
     assert mapped.models[0] == len(scene.records) == 10 * len(names)
     assert mapped.notes == ("global mapping of stations",)
     assert 0.02e-3 < camera_rms(mapped, scene) < 1e-3
-    found, true = pupils(mapped, scene)
-    assert abs(align_similarity(found, true).scale - 1.0) < 5e-4
+    assert abs(align_similarity(*pupils(mapped, scene)).scale - 1.0) < 5e-4
     trend = measure_doming(mapped.model, ()).scale
-    assert trend is not None
     assert trend.mean == pytest.approx(1.0, abs=1e-3)
 
 
@@ -131,25 +111,20 @@ def test_the_rig_is_held_constant_and_the_cameras_too() -> None:
     model = mapped.model
     assert mapped.baseline == pytest.approx(0.1, rel=1e-12)
     assert model_baseline(model) == pytest.approx(0.1, rel=1e-9)
-    lefts = {scene.records[n - 1].station: n for n in model.images if n % 2 == 1}
-    for number in lefts.values():
-        left = as_transform(model.images[number].cam_from_world())
-        right = as_transform(model.images[number + 1].cam_from_world())
-        np.testing.assert_allclose((right * left.inv()).translation, [-0.1, 0, 0], atol=1e-9)
+    poses = {n: as_transform(image.cam_from_world()) for n, image in model.images.items()}
+    for number in range(1, len(scene.records), 2):
+        shift = (poses[number + 1] * poses[number].inv()).translation
+        np.testing.assert_allclose(shift, [-0.1, 0, 0], atol=1e-9)
     for name, number in (("left", 1), ("right", 2)):
         expected = mapped.warps[name].pinhole
         focal, _, cx, cy = model.cameras[number].params
         assert (focal, cx, cy) == (expected.focal_px, expected.cx_px, expected.cy_px)
 
 
-@pytest.mark.parametrize(
-    ("names", "exif"),
-    [
-        (("left", "right"), ()),
-        (("left", "right"), ("left", "right")),
-        (("left", "right", "top"), ()),
-    ],
-)
+PAIR = ("left", "right")
+
+
+@pytest.mark.parametrize(("names", "exif"), [(PAIR, ()), (PAIR, PAIR), ((*PAIR, "top"), ())])
 def test_self_calibration_finds_focal_length_distortion_and_rig(
     names: tuple[str, ...], exif: tuple[str, ...]
 ) -> None:
@@ -175,42 +150,31 @@ def test_self_calibration_finds_focal_length_distortion_and_rig(
     assert mapped.models[0] == len(scene.records)
     assert not mapped.scaled
     assert mapped.baseline == 1.0
-    (rig,) = mapped.model.rigs.values()
-    assert len(rig.non_ref_sensors) == len(names) - 1
+    assert [len(rig.non_ref_sensors) for rig in mapped.model.rigs.values()] == [len(names) - 1]
     assert model_baseline(mapped.model) == pytest.approx(1.0, rel=1e-9)
     for warp in mapped.warps.values():
         assert warp.camera.fx_px == pytest.approx(760, rel=0.01)
         assert warp.camera.parameter("k1") == pytest.approx(-0.08, abs=0.02)
     found, true = pupils(mapped, scene)
     fit = align_similarity(found, true)
-    misses = np.linalg.norm(fit.apply(found) - true, axis=1)
-    assert np.sqrt((misses**2).mean()) < 0.01
+    assert np.sqrt(((fit.apply(found) - true) ** 2).sum(axis=1).mean()) < 0.01
     assert fit.scale == pytest.approx(0.2, rel=0.02)  # metres in a baseline
     assert mapped.model.compute_mean_reprojection_error() < 0.4
-    for camera in mapped.model.cameras.values():
-        assert camera.model_name == "PINHOLE"
+    assert {camera.model_name for camera in mapped.model.cameras.values()} == {"PINHOLE"}
 
 
 def oblique_scene(camera: pycolmap.Camera, rng: np.random.Generator, names: Sequence[str]) -> Scene:
     """Eight stations around a bumpy floor, looking at its middle; 0.2 m from left to right."""
     points = np.column_stack([rng.uniform(-1.6, 1.6, (700, 2)), rng.uniform(-0.25, 0.25, 700)])
     records, poses, pixels, ids = [], [], [], []
-    shifts: dict[str, Any] = {
-        "left": [0, 0, 0],
-        "right": [-0.2, 0.0, 0.0],
-        "top": [-0.1, 0.25, 0.02],
-    }
-    turns: dict[str, Any] = {"left": [0, 0, 0], "right": [0, 0.03, 0.01], "top": [-0.1, 0.05, 0.2]}
+    shifts = [[0, 0, 0], [-0.2, 0, 0], [-0.1, 0.25, 0.02]]
+    turns = Rotation.from_rotvec([[0, 0, 0], [0, 0.03, 0.01], [-0.1, 0.05, 0.2]])
+    cam_from_left = RigidTransform.from_components(shifts, turns)
     for station, angle in enumerate(0.35 * np.arange(8)):
         place = np.array([1.6 * np.cos(angle), 1.6 * np.sin(angle), -2.0])
-        forward = -place / np.linalg.norm(place)
-        side = np.cross(forward, [0.0, 0.0, -1.0])
-        side /= np.linalg.norm(side)
-        rotation = Rotation.from_matrix(np.column_stack([side, np.cross(forward, side), forward]))
-        left = RigidTransform.from_components(place, rotation)
-        for name in names:
-            turn = Rotation.from_rotvec(turns[name])
-            pose = left * RigidTransform.from_components(shifts[name], turn).inv()
+        axes, _ = Rotation.align_vectors([-place, [0, 0, 1]], [[0, 0, 1], [0, 1, 0]], [np.inf, 1])
+        for name, turned in zip(names, cam_from_left, strict=False):  # left, right and top
+            pose = RigidTransform.from_components(place, axes) * turned.inv()
             local = pose.inv().apply(points)
             seen = np.asarray(camera.img_from_cam(local))
             inside = np.all((seen > 0) & (seen < [800, 600]), axis=1) & (local[:, 2] > 0.3)
@@ -220,8 +184,8 @@ def oblique_scene(camera: pycolmap.Camera, rng: np.random.Generator, names: Sequ
             records.append(ImageRecord(image=f"{name}/{station}.png", camera=name, station=station))
     near = [(i, j) for i, j in combinations(range(len(ids)), 2)
             if abs(records[i].station - records[j].station) <= 3]  # fmt: skip
-    return Scene(
-        rig=make_scene(lines=1, stations=1, points=1).rig,
+    return replace(
+        make_scene(lines=1, stations=1, points=1),
         records=records,
         ned_from_cam=poses,
         points_ned=points,
@@ -289,11 +253,10 @@ def test_models_that_share_stations_become_one(
     second = part(mapped.model, {6, 7, 8, 9})
     second.transform(pycolmap.Sim3d(1.0, rigid3d(move).rotation, move.translation))
     found = second_from_first(first, second)
-    assert found is not None
     np.testing.assert_allclose(found.as_matrix(), move.as_matrix(), atol=1e-9)
 
     seen = seen_by_pinholes(scene)
-    rig = {n: seen.warps[n].pinhole_from_cam * p for n, p in scene.rig.cam_from_rig.items()}
+    rig = pinhole_rig(scene, seen)
     write_database(tmp_path / "d.db", seen, rig)
     joined = merge_models([first, second], tmp_path / "d.db", _options(rig, 1, "nothing"))
     assert [m.num_reg_images() for m in joined] == [18]
@@ -309,8 +272,7 @@ def test_models_that_share_stations_become_one(
     first = part(mapped.model, {1, 2, 3})
     assert second_from_first(first, alone) is None
     assert len(merge_models([first, alone], tmp_path / "d.db", _options(rig, 1, "nothing"))) == 2
-    notes = report_left_out([first, alone])
-    assert len(notes) == 1
-    assert "6 pictures" in notes[0] and "left/000006.png" in notes[0]
-    assert notes[0] in capsys.readouterr().err
+    (note,) = report_left_out([first, alone])
+    assert "6 pictures" in note and "left/000006.png" in note
+    assert note in capsys.readouterr().err
     assert report_left_out([first]) == report_left_out([]) == []

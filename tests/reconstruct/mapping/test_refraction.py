@@ -8,18 +8,16 @@ import numpy as np
 import pycolmap
 import pytest
 
-from alice_survey.core.frames import Array
-from alice_survey.core.records import RangeRecord
 from camera_calib.ports.dome import DomePort
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.refraction import SETTLED_PX, adjust_freely, refract
 from reconstruct.mapping.working_range import warp_record
-from reconstruct.placing.alignment import align_rigid, align_similarity
+from reconstruct.placing.alignment import align_similarity
 from reconstruct.views.range_shift import range_shift
 from tests.oracles_refraction import adjust_through_ports
 from tests.reconstruct.scenes import Scene, make_scene
-from tests.reconstruct.true_models import near_truth, pupils_and_points, warped_scene
+from tests.reconstruct.true_models import DISTANCES, points_of, pupils, rigid_rms, started
 
 PORTS = [(0.02, 0.0), (0.02, 2.0), (0.05, 0.0), (0.05, 2.0)]
 
@@ -39,31 +37,27 @@ def scene_at(port_m: float, tilt_deg: float, noise_px: float = 0.3) -> Scene:
 
 
 @cache
-def started(port_m: float, tilt_deg: float, noise_px: float = 0.3) -> tuple[Mapped, Observations]:
-    scene = scene_at(port_m, tilt_deg, noise_px)
-    seen, warps = warped_scene(scene)
-    return near_truth(scene, seen, warps, np.random.default_rng(1)), seen
+def started_at(*port: float) -> tuple[Mapped, Observations]:
+    return started(scene_at(*port))
 
 
-def rigid_rms(found: Array, true: Array) -> float:
-    return float(np.sqrt(((align_rigid(found, true).apply(found) - true) ** 2).sum(axis=1).mean()))
+def assert_exact(mapped: Mapped, scene: Scene) -> None:
+    assert rigid_rms(*points_of(mapped, scene)) < 0.01e-3
+    assert rigid_rms(*pupils(mapped, scene)) < 0.01e-3
 
 
 @pytest.mark.parametrize(("port_m", "tilt_deg"), PORTS)
 def test_without_noise_nothing_is_left_of_the_port(
     port_m: float, tilt_deg: float, tmp_path: Path
 ) -> None:
-    scene, start = scene_at(port_m, tilt_deg, 0.0), started(port_m, tilt_deg, 0.0)
+    scene, start = scene_at(port_m, tilt_deg, 0.0), started_at(port_m, tilt_deg, 0.0)
     mapped, found = refract(*start, tmp_path)
-    pupils, true_pupils, points, true_points = pupils_and_points(mapped, scene)
-    assert rigid_rms(points, true_points) < 0.01e-3
-    assert rigid_rms(pupils, true_pupils) < 0.01e-3
-    assert abs(align_similarity(points, true_points).scale - 1.0) < 1e-6
+    assert_exact(mapped, scene)
+    assert abs(align_similarity(*points_of(mapped, scene)).scale - 1.0) < 1e-6
     assert found.settled
     assert found.moved_px[0] > 100 * SETTLED_PX
-    warp_only = adjust_freely(start[0])
-    _, _, bent, _ = pupils_and_points(warp_only, scene)
-    assert rigid_rms(bent, true_points) > 0.05e-3, "what was to be corrected was there"
+    bent = points_of(adjust_freely(start[0]), scene)
+    assert rigid_rms(*bent) > 0.05e-3, "what was to be corrected was there"
 
 
 @pytest.mark.parametrize(
@@ -83,16 +77,11 @@ def test_without_noise_nothing_is_left_of_a_dome(
         dome_x_m=x, dome_y_m=y, dome_z_m=z, outer_radius_m=0.05, glass_thickness_m=0.005
     )
     scene = make_scene(lines=2, stations=4, points=900, port=dome, scale=1, relief_m=0.3)
-    seen, warps = warped_scene(scene)
-    start = near_truth(scene, seen, warps, np.random.default_rng(1))
-    mapped, found = refract(start, seen, tmp_path)
-    pupils, true_pupils, points, true_points = pupils_and_points(mapped, scene)
-    assert rigid_rms(points, true_points) < 0.01e-3
-    assert rigid_rms(pupils, true_pupils) < 0.01e-3
+    mapped, found = refract(*started(scene), tmp_path)
+    assert_exact(mapped, scene)
     assert found.settled
     assert found.corrected_px == pytest.approx(corrected_px, rel=0.2)
-    distances = RangeRecord(near_m=1.75, far_m=2.35, source="test")
-    record = warp_record(warps["left"], distances)
+    record = warp_record(mapped.warps["left"], DISTANCES)
     assert record.contraction == pytest.approx(contraction, rel=0.2)
 
 
@@ -100,16 +89,11 @@ def test_without_noise_nothing_is_left_of_a_dome(
 def test_with_noise_points_are_those_of_an_exact_refractive_adjustment(
     port_m: float, tilt_deg: float, tmp_path: Path
 ) -> None:
-    scene, start = scene_at(port_m, tilt_deg), started(port_m, tilt_deg)
-    mapped, _ = refract(*start, tmp_path)
-    _, _, points, true_points = pupils_and_points(mapped, scene)
+    scene = scene_at(port_m, tilt_deg)
+    mapped, _ = refract(*started_at(port_m, tilt_deg), tmp_path)
+    points, true_points = points_of(mapped, scene)
     ids = np.array(sorted(mapped.model.points3D)) - 1
-    stations = [
-        pose
-        for pose, record in zip(scene.ned_from_cam, scene.records, strict=True)
-        if record.camera == scene.rig.reference
-    ]
-    _, oracle = adjust_through_ports(scene, stations, scene.points_ned[ids], ids)
+    _, oracle = adjust_through_ports(scene, scene.left.ned_from_cam, scene.points_ned[ids], ids)
     ours, best = rigid_rms(points, true_points), rigid_rms(oracle, true_points)
     assert 0.9 * best < ours < 1.05 * best
     assert rigid_rms(points, oracle) < 0.25 * best
@@ -118,7 +102,7 @@ def test_with_noise_points_are_those_of_an_exact_refractive_adjustment(
 
 def test_keypoints_end_where_the_field_of_the_lens_says(tmp_path: Path) -> None:
     """The later stages read the model through `RangeShift`: both must agree."""
-    scene, start = scene_at(0.05, 2.0), started(0.05, 2.0)
+    scene, start = scene_at(0.05, 2.0), started_at(0.05, 2.0)
     mapped, _ = refract(*start, tmp_path)
     for number, image in mapped.model.images.items():
         shift = range_shift(mapped.warps[scene.records[number - 1].camera])
@@ -134,24 +118,19 @@ def test_wrong_matches_go_and_right_ones_stay(tmp_path: Path) -> None:
     scene = scene_at(0.05, 0.0)
     rng = np.random.default_rng(4)
     pixels = [p.copy() for p in scene.pixels]
-    spoiled = 0
     for rows in pixels:
         bad = rng.choice(len(rows), 2, replace=False)
         rows[bad] += rng.choice([-1.0, 1.0], (2, 2)) * rng.uniform(25, 40, (2, 2))
-        spoiled += 2
-    wrong = replace(scene, pixels=pixels)
-    seen, warps = warped_scene(wrong)
-    start = near_truth(wrong, seen, warps, np.random.default_rng(1))
-    mapped, found = refract(start, seen, tmp_path)
-    total = start.model.compute_num_observations()
+    start = started(replace(scene, pixels=pixels))
+    mapped, found = refract(*start, tmp_path)
+    total, spoiled = start[0].model.compute_num_observations(), 2 * len(pixels)
     assert spoiled <= found.removed < spoiled + 0.25 * total
-    _, _, points, true_points = pupils_and_points(mapped, wrong)
-    assert rigid_rms(points, true_points) < 4e-3
+    assert rigid_rms(*points_of(mapped, scene)) < 4e-3
 
 
 def test_with_matches_lost_observations_come_back(tmp_path: Path) -> None:
     """A track that lost a picture's keypoint gets it back, at its exact place."""
-    scene, start = scene_at(0.05, 0.0), started(0.05, 0.0)
+    scene, start = scene_at(0.05, 0.0), started_at(0.05, 0.0)
     seen = replace(start[1], pairs=scene.pairs)
     model = pycolmap.Reconstruction(start[0].model)
     for point in list(model.points3D)[::3]:

@@ -1,3 +1,5 @@
+from itertools import product
+
 import numpy as np
 import pytest
 
@@ -48,22 +50,17 @@ def test_features_keep_away_from_the_border_of_a_mask() -> None:
     found = find_features(blobs(centres, sigma=sigma), mask, maximum=100)
     whole = find_features(blobs(centres, sigma=sigma), None, maximum=100)
     assert np.linalg.norm(nearest(whole.pixels, centres[1]) - centres[1]) < 0.1
-    assert np.linalg.norm(nearest(found.pixels, centres[0]) - centres[0]) > 0.1 or len(found.pixels)
     reach = 52.0 - found.pixels[:, 0]
     assert np.all(reach > 1.4 * found.scale_px)
     assert len(found.pixels) < len(whole.pixels)
 
 
-@pytest.mark.parametrize("size", [(846, 677), (1360, 1024), (3384, 2710)])
-@pytest.mark.parametrize("maximum", [3000, 8000, 50_000])
-def test_pictures_are_reduced_to_what_their_features_need(
-    size: tuple[int, int], maximum: int
-) -> None:
+def test_pictures_are_reduced_to_what_their_features_need() -> None:
     """To 100 pixels for each, and to 1.5 megapixels in any case."""
-    area = size[0] * size[1]
-    first, largest = (min(1.0, np.sqrt(px / area)) for px in (100.0 * maximum, 1.5e6))
-    expected = (first, largest) if first < largest else (largest,)
-    assert detection_scales(size, maximum) == pytest.approx(expected, rel=1e-12)
+    for size, maximum in product([(846, 677), (1360, 1024), (3384, 2710)], [3000, 8000, 50_000]):
+        first, largest = (min(1.0, np.sqrt(px / np.prod(size))) for px in (100 * maximum, 1.5e6))
+        expected = (first, largest) if first < largest else (largest,)
+        assert detection_scales(size, maximum) == pytest.approx(expected, rel=1e-12)
 
 
 def test_a_picture_with_little_to_show_is_searched_at_full_scale() -> None:

@@ -1,6 +1,7 @@
 import itertools
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,7 +9,6 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.executor import SERIAL
 from alice_survey.core.manifest import ImageRecord
-from camera_calib.rig import Rig
 from reconstruct.matching.features import save_features
 from reconstruct.matching.pairs import (
     NEIGHBOURS,
@@ -23,27 +23,17 @@ from reconstruct.matching.pairs import (
 from tests.oracles_matching import vlad_slowly
 from tests.reconstruct.matching.test_matches import plain_features
 from tests.reconstruct.rig_survey import four_cameras
-from tests.reconstruct.scenes import ALTITUDE_M, DATUM, make_scene
+from tests.reconstruct.scenes import ALTITUDE_M, DATUM, make_scene, stating
 
 
 def mono(count: int) -> list[ImageRecord]:
     return [ImageRecord(image=f"{i}.png", camera="camera", station=i) for i in range(count)]
 
 
-def stereo(count: int) -> list[ImageRecord]:
-    return [
-        ImageRecord(image=f"{side}/{i}.png", camera=side, station=i)
-        for side in ("left", "right")
-        for i in range(count)
-    ]
-
-
 def test_neighbours_of_stereo_stations_cross_the_cameras() -> None:
-    records = stereo(3)
-    expected = {
-        (i, j) for i, j in itertools.combinations(range(6), 2)
-        if abs(records[i].station - records[j].station) <= 1
-    }  # fmt: skip
+    records = [replace(one, camera=side) for side in ("left", "right") for one in mono(3)]
+    pairs = itertools.combinations(range(6), 2)
+    expected = {(i, j) for i, j in pairs if abs(records[i].station - records[j].station) <= 1}
     assert neighbours(records, 1) == expected and len(expected) == 3 + 2 * 4
 
 
@@ -51,15 +41,11 @@ def test_many_pictures_with_positions_get_their_nearest() -> None:
     side = 10
     row, column = np.divmod(np.arange(side * side), side)
     column = np.where(row % 2 == 0, column, side - 1 - column)
-    places = DATUM.geodetic_from_ned(10.0 * np.column_stack([row, column, np.full(len(row), -8)]))
-    records = [
-        replace(one, latitude_deg=latitude, longitude_deg=longitude, depth_m=depth)
-        for one, (latitude, longitude, depth) in zip(mono(len(row)), places.tolist(), strict=True)
-    ]
+    places = 10.0 * np.column_stack([row, column, np.full(len(row), -8)])
+    records = stating(mono(len(row)), places)
     sure, maybe = choose_pairs(records, None, DATUM)
     pairs = set(sure) | set(maybe)
-    across = [(i, 2 * side - 1 - i) for i in range(side)]  # the next line, side by side
-    assert all(pair in pairs for pair in across)
+    assert {(i, 2 * side - 1 - i) for i in range(side)} <= pairs  # the next line, side by side
     assert (0, side * side - 1) not in pairs
     assert len(pairs) < 25 * len(records)
 
@@ -73,10 +59,9 @@ def test_footprints_have_the_size_of_the_exact_port_camera() -> None:
     corners = camera.at_depth(camera.border(8), depth)
     across, along = np.ptp(corners[:, 0]), np.ptp(corners[:, 1])
     south, west, north, east = left.bounds
-    assert north - south == pytest.approx(along, abs=2e-3)
-    assert east - west == pytest.approx(across, abs=2e-3)
-    assert right.centroid.y - left.centroid.y == pytest.approx(scene.rig.baseline_m, abs=1e-3)
-    assert right.centroid.x - left.centroid.x == pytest.approx(0.0, abs=1e-3)
+    assert (north - south, east - west) == pytest.approx((along, across), abs=2e-3)
+    apart = (right.centroid.y - left.centroid.y, right.centroid.x - left.centroid.x)
+    assert apart == pytest.approx((scene.rig.baseline_m, 0.0), abs=1e-3)
 
 
 def test_pairs_by_footprint_are_those_that_share_the_sea_floor() -> None:
@@ -104,32 +89,27 @@ def test_cameras_that_see_nothing_together_are_paired_across_stations() -> None:
     """One looks ahead and one astern, which sees what the first saw before; two beside overlap."""
     one = four_cameras().cameras["wide"]
     turns = {"fore": 28.0, "aft": -28.0, "beside": -26.0}
-    rig = Rig(
-        cameras=dict.fromkeys(turns, one),
-        cam_from_rig={
-            name: RigidTransform.from_rotation(Rotation.from_euler("x", turn, degrees=True)).inv()
-            for name, turn in turns.items()
-        },
-        body_from_rig=four_cameras().body_from_rig,
-        source="test",
-    )
+    poses = {
+        name: RigidTransform.from_rotation(Rotation.from_euler("x", -turn, degrees=True))
+        for name, turn in turns.items()
+    }
+    rig = replace(four_cameras(), cameras=dict.fromkeys(turns, one), cam_from_rig=poses)
     scene = make_scene(lines=1, stations=9, points=9000, rig=rig)
-    sure, maybe = choose_pairs(scene.records, rig, DATUM)
-    shared = {(i, j): len(np.intersect1d(scene.ids[i], scene.ids[j])) for i, j in (*sure, *maybe)}
+    sure, _ = choose_pairs(scene.records, rig, DATUM)
     cameras: dict[str, list[int]] = {}
     for i, j in sure:
         here, there = scene.records[i], scene.records[j]
         if here.station != there.station:
             names = " ".join(sorted((here.camera, there.camera)))
-            cameras.setdefault(names, []).append(shared[i, j])
+            shared = len(np.intersect1d(scene.ids[i], scene.ids[j]))
+            cameras.setdefault(names, []).append(shared)
     assert set(cameras) >= {"aft fore", "beside fore"} and "aft beside" not in cameras
     assert len(cameras["aft fore"]) >= 5 and min(cameras["aft fore"]) > 100
     assert max(np.bincount(np.ravel(sure))) <= 30
 
 
 def test_pictures_without_navigation_are_tied_to_their_neighbours() -> None:
-    scene = make_scene(points=50)
-    lost = 6
+    scene, lost = make_scene(points=50), 6
     records = [replace(r, latitude_deg=np.nan) if r.station == lost else r for r in scene.records]
     sure, _ = choose_pairs(records, scene.rig, DATUM)
     stations = [{records[i].station for i in pair} for pair in sure]
@@ -153,9 +133,8 @@ def test_pictures_that_look_alike_get_a_look_where_navigation_is_silent() -> Non
     assert maybe == [(3, 150)]
     assert (4, 5) in sure
     scene = make_scene(points=1)
-    assert choose_pairs(scene.records, scene.rig, DATUM, [(0, 39)]) == choose_pairs(
-        scene.records, scene.rig, DATUM
-    )
+    placed = (scene.records, scene.rig, DATUM)
+    assert choose_pairs(*placed, [(0, 39)]) == choose_pairs(*placed)
 
 
 def strip(folder: Path, pictures: int = 40, shared: int = 60) -> list[Path]:
@@ -193,8 +172,7 @@ def test_vectors_equal_those_of_the_slow_twin(tmp_path: Path) -> None:
 def test_pictures_that_see_the_horizon_are_paired_by_order_and_looks(off_nadir_deg: float) -> None:
     scene = make_scene(lines=1, stations=70, points=50)
     tilt = RigidTransform.from_rotation(Rotation.from_euler("x", off_nadir_deg, degrees=True))
-    upright = scene.rig.body_from_rig
-    assert upright is not None
+    upright: Any = scene.rig.body_from_rig
     rig = replace(scene.rig, body_from_rig=upright * tilt)
     assert not placed_pictures(scene.records, rig, DATUM)
     sure, maybe = choose_pairs(scene.records, rig, DATUM, alike=[(0, 60)])

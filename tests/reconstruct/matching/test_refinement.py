@@ -26,17 +26,14 @@ class Texture:
         self.waves = rng.normal(0, 0.35, (60, 2))
         self.phases = rng.uniform(0, 2 * np.pi, 60)
 
-    def at(self, points: np.ndarray) -> np.ndarray:
-        return 120 + 6 * np.cos(points @ self.waves.T + self.phases).sum(axis=-1)
-
     def picture(
         self, affine: np.ndarray, shift: np.ndarray, gain: float = 1.0, noise: float = 0.0
     ) -> np.ndarray:
         """What a camera sees that shows the texture's p at pixel `affine @ p + shift`."""
         x, y = np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5)
         points = (np.stack([x, y], axis=-1) - shift) @ np.linalg.inv(affine).T
-        levels = gain * self.at(points) + 8
-        levels = levels + np.random.default_rng(1).normal(0, noise, levels.shape)
+        levels = 120 + 6 * np.cos(points @ self.waves.T + self.phases).sum(axis=-1)
+        levels = gain * levels + 8 + np.random.default_rng(1).normal(0, noise, levels.shape)
         return np.rint(levels).clip(0, 255).astype(np.uint8)
 
 
@@ -44,14 +41,11 @@ AFFINE = np.array([[0.95, 0.21], [-0.17, 1.08]])
 SHIFT = np.array([7.3, 12.6])
 
 
-def spots(count: int, seed: int = 2) -> np.ndarray:
-    return np.random.default_rng(seed).uniform([30, 35], [115, 85], (count, 2))
+def spots(count: int) -> np.ndarray:
+    return np.random.default_rng(2).uniform([30, 35], [115, 85], (count, 2))
 
 
-Views = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-
-
-def two_views(seed: int, count: int, gain: float, noise: float) -> Views:
+def two_views(seed: int, count: int, gain: float, noise: float) -> tuple[np.ndarray, ...]:
     """Two pictures of a texture, spots in the first, and where the second shows them."""
     texture, reference = Texture(seed), spots(count)
     first = texture.picture(np.eye(2), np.zeros(2), noise=noise)
@@ -75,8 +69,8 @@ def test_alignment_equals_a_general_solver() -> None:
     guess = truth + np.array([0.4, -0.3])
     found = align_patches(first, second, reference, guess, np.broadcast_to(AFFINE, (6, 2, 2)))
     slow = [
-        align_slowly(first, second, r, g, AFFINE, radius=7, sigma=5.0)
-        for r, g in zip(reference, guess, strict=True)
+        align_slowly(first, second, *places, AFFINE, radius=7, sigma=5.0)
+        for places in zip(reference, guess, strict=True)
     ]
     # the two interpolate differently
     np.testing.assert_allclose(found, slow, atol=0.03)
@@ -123,13 +117,11 @@ def test_tracks_mean_one_spot_in_all_pictures(tmp_path: Path, threads: int) -> N
         (np.eye(2), np.zeros(2)), (AFFINE, SHIFT), (np.diag([1.1, 0.9]), np.array([-8.0, 6.0]))
     ]  # fmt: skip
     rng = np.random.default_rng(6)
-    greys, first_guess = [], []
-    for k, (affine, shift) in enumerate(views):
+    greys, first_guess = [tmp_path / f"{k}.npy" for k in range(3)], []
+    for path, (affine, shift) in zip(greys, views, strict=True):
         guess = points @ affine.T + shift + rng.normal(0, 0.4, points.shape)
-        lonely = np.array([[70.0, 60.0]])
-        greys.append(tmp_path / f"{k}.npy")
-        first_guess.append(np.concatenate([guess, lonely]))
-        np.save(greys[k], texture.picture(affine, shift, noise=1.0))
+        first_guess.append(np.concatenate([guess, [[70.0, 60.0]]]))
+        np.save(path, texture.picture(affine, shift, noise=1.0))
     same = np.repeat(np.arange(50, dtype=np.uint32)[:, None], 2, axis=1)
     found = refine_tracks(
         first_guess, greys, [(0, 1, same), (1, 2, same)], executor=local_executor(threads)

@@ -35,9 +35,15 @@ def in_model(pose: RigidTransform, ned_from_model: Similarity) -> RigidTransform
 
 
 def fit(
-    scene: Scene, records: list[ImageRecord], truth: Similarity, *, known: bool,
-    levers: bool = True, datum: Datum | None = DATUM, lean_deg: float = 0.0,
-) -> PlacementFit:  # fmt: skip
+    scene: Scene,
+    records: list[ImageRecord],
+    truth: Similarity,
+    *,
+    known: bool,
+    levers: bool = True,
+    datum: Datum | None = DATUM,
+    lean_deg: float = 0.0,
+) -> PlacementFit:
     """Of a model that starts level but for a lean; None where navigation does not suffice."""
     poses = [in_model(pose, truth) for pose in scene.ned_from_cam]
     points = points_in_model(scene.points_ned, truth)
