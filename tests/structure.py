@@ -30,15 +30,15 @@ PACKAGES = ("alice_survey", "camera_calib", "missions", "reconstruct")
 WORDS = Path(__file__).with_name("structure_words.toml")
 """Words that are not used, and where each of them counts."""
 BOUNDS = {
-    "code lines of the packages": 69_450,
-    "code lines of the tests": 50_501,  # goal: 48_000
+    "code lines of the packages": 69_770,  # 69,438, and a part of the reserve of 2,000
+    "code lines of the tests": 48_840,  # goal: 48_000
     "code lines of the benchmarks": 8_000,
-    "lines of our own JavaScript": 4_901,
+    "lines of our own JavaScript": 4_900,
     "modules": 393,
-    "modules with a single importer": 73,
+    "modules with a single importer": 72,
     "kernels": 241,
     "commands": 36,
-    "options of commands": 341,
+    "options of commands": 345,
     "settings": 125,
     "functions that take the whole SurveyConfig": 14,
     "layers of the import contract": 8,
