@@ -86,12 +86,14 @@ class Bag:
                 values[name] = fields.get(name, np.zeros(of[1]))
         return self.store.types[kind](**values)
 
-    def add(self, topic: str, kind: str, stamp_ns: int, frame: str, **fields: Any) -> None:
-        """A message with a header."""
+    def add(
+        self, topic: str, kind: str, stamp_ns: int, frame: str, stored_ns: int = 0, **fields: Any
+    ) -> None:  # fmt: skip
+        """A message with a header, stored when it was stamped if not later."""
         sec, nanosec = divmod(stamp_ns, 10**9)
         header = {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": frame}
         message = self.make(kind, {"header": header, **fields})
-        self.rows.append((stamp_ns, topic, kind, message))
+        self.rows.append((stored_ns or stamp_ns, topic, kind, message))
 
     def add_nav_sts(
         self, stamp_ns: int, place: Sequence[float], attitude_rad: Sequence[float],

@@ -500,6 +500,7 @@ def placed_alone(scene: Scene, rng: np.random.Generator) -> tuple[float, float, 
         as_transform(found.mapped.model.images[n].cam_from_world()).inv()
         for n in sorted(found.mapped.model.images)
     ]
+    assert found.shape is not None
     points = np.array([p.xyz for p in found.mapped.model.points3D.values()])
     fit: Any = fit_navigation(
         scene.records, pinholes, body_from_pinhole(scene.rig, start.warps), DATUM,

@@ -167,12 +167,14 @@ def oblique_scene(camera: pycolmap.Camera, rng: np.random.Generator, names: Sequ
     """Eight stations around a bumpy floor, looking at its middle; 0.2 m from left to right."""
     points = np.column_stack([rng.uniform(-1.6, 1.6, (700, 2)), rng.uniform(-0.25, 0.25, 700)])
     records, poses, pixels, ids = [], [], [], []
-    shifts = [[0, 0, 0], [-0.2, 0, 0], [-0.1, 0.25, 0.02]]
+    shifts = np.array([[0, 0, 0], [-0.2, 0, 0], [-0.1, 0.25, 0.02]])
     turns = Rotation.from_rotvec([[0, 0, 0], [0, 0.03, 0.01], [-0.1, 0.05, 0.2]])
     cam_from_left = RigidTransform.from_components(shifts, turns)
     for station, angle in enumerate(0.35 * np.arange(8)):
         place = np.array([1.6 * np.cos(angle), 1.6 * np.sin(angle), -2.0])
-        axes, _ = Rotation.align_vectors([-place, [0, 0, 1]], [[0, 0, 1], [0, 1, 0]], [np.inf, 1])
+        axes, _ = Rotation.align_vectors(
+            np.array([-place, [0, 0, 1]]), np.eye(3)[[2, 1]], [np.inf, 1]
+        )
         for name, turned in zip(names, cam_from_left, strict=False):  # left, right and top
             pose = RigidTransform.from_components(place, axes) * turned.inv()
             local = pose.inv().apply(points)

@@ -70,8 +70,8 @@ def test_geometry_keeps_true_matches_and_drops_false_ones(tmp_path: Path) -> Non
     points = np.column_stack([rng.uniform(-0.7, 0.7, (120, 2)), rng.uniform(2.2, 2.8, 120)])
     seen = [camera.img_from_cam(points - shift) for shift in ([0, 0, 0], [0.3, 0.05, 0.1])]
     sides = np.concatenate([seen, rng.uniform(0, 600, (2, outliers, 2))], axis=1)
-    descriptors = rng.integers(0, 90, (120 + outliers, 128))
-    task = pair_task(tmp_path, camera, *((side, descriptors) for side in sides))
+    descriptors: Any = rng.integers(0, 90, (120 + outliers, 128))
+    task = pair_task(tmp_path, camera, (sides[0], descriptors), (sides[1], descriptors))
     found = match_pair(task)
     assert found.geometry is not None
     right = int((found.matches[:, 0] < true).sum())

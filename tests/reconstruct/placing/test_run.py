@@ -12,7 +12,7 @@ from pyproj import Transformer
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.app.stages import spec
-from alice_survey.core.artefacts import read_json
+from alice_survey.core.artefacts import read_json, renew_outputs
 from alice_survey.core.config import ReconstructConfig, SurveyConfig
 from alice_survey.core.errors import AliceError, ReconstructionError
 from alice_survey.core.executor import SERIAL, Executor, local_executor
@@ -206,6 +206,7 @@ def test_a_rig_of_other_pictures_is_refused(drone: Path, tmp_path: Path) -> None
     manifest = folder / "images" / "manifest.csv"
     records = [replace(r, camera="left") for r in read_manifest(manifest)]
     write_manifest(manifest, records)
+    renew_outputs(manifest.parent, [manifest])
     with pytest.raises(AliceError, match=r"800 x 450.*3384 x 2710"):
         reconstruct(folder, QUICK, SERIAL)
 

@@ -37,7 +37,7 @@ def flight(lines: int = 4, stations: int = 12) -> RigidTransform:
     line, step = np.divmod(np.arange(lines * stations), stations)
     at = np.where(line % 2 == 0, step, stations - 1 - step)
     lean = np.random.default_rng(99).normal(0, np.deg2rad(1.5), (len(at), 2))
-    attitudes = rotation_from_attitude(*lean.T, np.pi * (line % 2))
+    attitudes = rotation_from_attitude(lean[:, 0], lean[:, 1], np.pi * (line % 2))
     return RigidTransform.from_components(
         np.column_stack([0.5 * at, line, np.full(len(at), 13.0)]), attitudes
     )
