@@ -87,7 +87,7 @@ class Bag:
         return self.store.types[kind](**values)
 
     def add(
-        self, topic: str, kind: str, stamp_ns: int, frame: str, stored_ns: int = 0, **fields: Any
+        self, topic: str, kind: str, stamp_ns: int, frame: str, stored_ns: Any = 0, **fields: Any
     ) -> None:  # fmt: skip
         """A message with a header, stored when it was stamped if not later."""
         sec, nanosec = divmod(stamp_ns, 10**9)
