@@ -94,7 +94,7 @@ def export_projected(workspace: Path, crs: str) -> tuple[str, dict[str, Any]]:
     stage = Stage(
         name=folder,
         version=3,
-        command="export",
+        command="reconstruct",
         settings={"crs": target.crs.to_wkt()},
         inputs=[workspace / name for name in ("dense", "mosaic", "mesh")],
     )
@@ -273,7 +273,7 @@ def export_undistorted(workspace: Path, executor: Executor) -> tuple[str, dict[s
     stage = Stage(
         name=FOLDER,
         version=2,
-        command="export",
+        command="reconstruct",
         settings={},
         inputs=[sparse / "model", sparse / "cameras.json", sparse / "frame.json",
                 workspace / "mesh" / "mesh.ply", workspace / "images"],

@@ -130,7 +130,7 @@ def test_every_damaged_product_is_made_again(small_survey: Path, workspace: Path
     assert results(workspace) == results(small_survey)
 
 
-def test_an_edited_mission_is_flown_only_if_told_so(workspace: Path) -> None:
+def test_an_edited_mission_is_flown_only_on_request(workspace: Path) -> None:
     exports = workspace / "plan" / "exports"
     mission = exports / "mission_dive1.xml"
     fly = ["fly", "-w", str(workspace), "--mission", str(mission)]

@@ -26,7 +26,6 @@ from alice_survey.core.config import (
 from alice_survey.core.errors import ConfigError, WorkspaceError, warn
 from alice_survey.core.executor import Executor, local_executor
 from alice_survey.core.run import progress
-from alice_survey.core.run.progress import part
 from alice_survey.core.settings_form import settings_template
 from alice_survey.core.stages import is_imported
 
@@ -82,7 +81,6 @@ def run(
                     "surveys: choose another workspace with -w"
                 )
     from alice_survey.app.computing import task_memory_mib
-    from missions.exports.write import check_exported
 
     lines, found = [], {}
     executor = executor or local_executor()
@@ -96,10 +94,12 @@ def run(
             if all(state.startswith("stale") for state in states):
                 warn(f"the plan is {states[0]}; 'alice-survey plan -w {workspace}' renews it")
         for number, stage in enumerate(map(spec, stages), 1):
-            with part(stage.folder, number, len(stages)):
+            with progress.part(stage.folder, number, len(stages)):
                 flies = stage.name == "fly" and not edited_mission
                 mission = config.vehicle.mission_file if flies else None
                 if mission is not None and stage.state(workspace, config, {}) != "up to date":
+                    from missions.exports.write import check_exported
+
                     check_exported(mission)
                 for needed in stage.needs:
                     spec(needed).need(workspace)
@@ -261,7 +261,7 @@ def stage_states(workspace: Path, config: Config, *, verify: bool = False) -> di
     """
     if verify:
         for folder, record in finished_stages(workspace).items():
-            with progress.step(f"read {folder}"):
+            with progress.step(f"read {folder}"):  # what differs has a new time from then on
                 damage(workspace / folder, record, entirely=True)
     imported = is_imported(workspace)
     states: dict[str, str] = {}

@@ -25,7 +25,7 @@ from typing import Any, ClassVar, Self, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic_core import to_jsonable_python
 
-from alice_survey.core.contents import as_line, first_fault, ordinary_file
+from alice_survey.core.contents import MAX_TEXT, as_line, first_fault, ordinary_file
 from alice_survey.core.errors import AliceError, NavigationError, WorkspaceError, warn, why
 from alice_survey.core.run import progress
 from alice_survey.core.run.resources import processor, versions, watch_meter
@@ -336,7 +336,7 @@ def damage(
         entirely: read all files; else only those of another size or modification time.
     """
     for name, entry in record.outputs.items():
-        if not exports and name.startswith(f"{EXPORTS}/"):
+        if not exports and _is_export(name):
             continue
         path = folder / name
         try:
@@ -350,15 +350,26 @@ def damage(
 
 
 def renew_outputs(folder: Path, written: Iterable[Path]) -> None:
-    """Record files that a command has written again into a finished stage's folder."""
+    """Record files that a command has written again into a finished stage's folder.
+
+    Exports that it has removed are no longer asked for.
+    """
     record = read_stage(folder)
     if record is None or not record.outputs:
         return
-    outputs = {name: entry for name, entry in record.outputs.items() if (folder / name).exists()}
+    outputs = {
+        name: entry
+        for name, entry in record.outputs.items()
+        if not _is_export(name) or (folder / name).exists()
+    }
     outputs |= {path.relative_to(folder).as_posix(): _entry(path, None) for path in written}
     values = record.to_json() | {"outputs": outputs}
     values.pop("checksum")
     write_json(folder / STAGE_FILE, values | {"checksum": _checksum(values)})
+
+
+def _is_export(name: str) -> bool:
+    return name.startswith(f"{EXPORTS}/")
 
 
 def _is_entry(path: Path, now: FileEntry, written: FileEntry) -> bool:
@@ -368,13 +379,14 @@ def _is_entry(path: Path, now: FileEntry, written: FileEntry) -> bool:
     it who do not read it.
     """
     if now[2] != written[2] and now[:2] == written[:2]:
-        os.utime(path)
+        with contextlib.suppress(OSError):  # of a workspace that cannot be written
+            os.utime(path)
     return now[2] == written[2]
 
 
 def _damage_error(folder: Path, record: StageRecord, damaged: str) -> WorkspaceError:
     again = f"'alice-survey {record.command}'" if record.command else "the command that wrote it"
-    return WorkspaceError(f"{folder}: {damaged}; run {again} again, which makes it anew")
+    return WorkspaceError(f"{folder}: {damaged}; run {again} again, which makes it")
 
 
 def _checksum(record: Mapping[str, Any]) -> str:
@@ -411,7 +423,7 @@ def _intact_inputs(inputs: Sequence[Path], workspace: Path) -> dict[str, FileEnt
     for folder, record in makers.items():
         for name, entry in record.outputs.items():
             now = found.get(os.path.relpath(folder / name, workspace), entry)
-            if not name.startswith(f"{EXPORTS}/") and not _is_entry(folder / name, now, entry):
+            if not _is_export(name) and not _is_entry(folder / name, now, entry):
                 raise _damage_error(folder, record, f"{name} has changed since it was written")
     return found
 
@@ -610,7 +622,8 @@ def read_csv(
         lacks is empty.
 
     Raises:
-        AliceError: of type `fault`: the file cannot be read, or lacks a column.
+        AliceError: of type `fault`: the file cannot be read, lacks a column, or has a row with more
+            cells than the header.
     """
     names, rows = stream_csv(path, required, exact=exact, fault=fault)
     return names, list(rows)
@@ -666,15 +679,11 @@ def _csv_faults(path: Path, fault: type[AliceError]) -> Iterator[None]:
         raise fault(f"{path}: cannot be read: {why(error)}") from None
 
 
-_MAX_LENGTH = 512 << 20
-"""Bytes of a file that is read whole."""
-
-
 class StaleError(AliceError):
     """What is to be changed is no longer what was seen."""
 
 
-def content_of(path: Path, maximum: int = _MAX_LENGTH) -> bytes | None:
+def content_of(path: Path, maximum: int = MAX_TEXT) -> bytes | None:
     """The content of a file; None where there is none.
 
     Raises:

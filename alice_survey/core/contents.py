@@ -25,11 +25,11 @@ if TYPE_CHECKING:
 _SHOWN = 200
 
 
-_MAX_TEXT = 512 << 20
+MAX_TEXT = 512 << 20
 """Bytes of a text that is read whole."""
 
 
-def ordinary_file(path: Path, maximum: int | None = _MAX_TEXT) -> Path:
+def ordinary_file(path: Path, maximum: int | None = MAX_TEXT) -> Path:
     """A path that may be opened and read: all files from outside are opened through this.
 
     A pipe is waited on for ever, and a device has no end.

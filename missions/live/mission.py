@@ -29,7 +29,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from alice_survey.core.artefacts import read_stage, refuse_damage, write_csv
-from alice_survey.core.errors import VehicleError
+from alice_survey.core.errors import VehicleError, WorkspaceError
 from alice_survey.core.frames import Array, attitude_from_rotation, rotation_from_attitude
 from alice_survey.sim.vehicle import estimate_vector as vector
 from alice_survey.sim.vehicle.navigation.sensors import DvlSpec
@@ -343,7 +343,7 @@ class PilotLoop:
 
 
 def plan_to_fly(workspace: Path, dive: int | None, *, edited: bool = False) -> Plan:
-    """The plan of a workspace, or one dive of it, from 1 on; an edited one only if told so.
+    """The plan of a workspace, or one dive of it, from 1 on; an edited one only on request.
 
     Raises:
         PlanError: the plan lacks that dive.
@@ -351,7 +351,10 @@ def plan_to_fly(workspace: Path, dive: int | None, *, edited: bool = False) -> P
     """
     folder = workspace / "plan"
     if not edited:
-        refuse_damage(folder, read_stage(folder))
+        try:
+            refuse_damage(folder, read_stage(folder))
+        except WorkspaceError as error:
+            raise WorkspaceError(f"{error}, or fly it as it is with --edited") from None
     return one_dive(read_plan(folder / "plan.json"), dive)
 
 

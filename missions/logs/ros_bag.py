@@ -453,7 +453,8 @@ def opened_bag(path: Path) -> Iterator["AnyReader"]:
     for name, text in _COLA2.items():
         store.register(get_types_from_msg(text, name))
     try:
-        for file in path.iterdir() if path.is_dir() else [path]:
+        files = path.iterdir() if path.is_dir() else [path]
+        for file in (one for one in files if not one.is_dir()):
             with ordinary_file(file, None).open("rb") as opened:
                 if file.suffix.lower() == ".bag" and b"\n" not in opened.read(16):
                     raise ValueError("its first line is not that of a bag")

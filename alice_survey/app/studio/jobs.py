@@ -277,13 +277,8 @@ class _Job:
         code = run.exit_code
         if code is None and self._process is not None:
             code = self._process.returncode
-        state = (
-            "killed"
-            if code is None or code < 0
-            else "done"
-            if code in (0, NOT_GOOD_ENOUGH)
-            else "failed"
-        )
+        is_done = code in (0, NOT_GOOD_ENOUGH)
+        state = "killed" if code is None or code < 0 else "done" if is_done else "failed"
         if code in _CODES_OF_STOP or (self.stopping and state != "done"):
             state = "stopped"
         line = run.error or ("" if state == "done" else _last_line(self.folder / ERRORS))

@@ -26,6 +26,7 @@ from urllib.parse import quote
 try:
     import uvicorn
     from starlette.applications import Starlette
+    from starlette.background import BackgroundTask
     from starlette.concurrency import run_in_threadpool
     from starlette.datastructures import Headers, MutableHeaders
     from starlette.middleware import Middleware
@@ -92,7 +93,7 @@ _LOCKED = {
 }
 _TOKEN, _PAGE = "X-Studio-Token", "X-Studio-Page"
 """Headers: the token, and a name of the page that asks."""
-_NEEDS_TOKEN = "this needs the address with its token, as the command printed it"  # noqa: S105
+_NEEDS_TOKEN = "this needs the address with its token, as the command printed it"  # noqa: S105 (a line)
 _MAX_STREAMS = 100
 """Pages that listen for events."""
 _COMPUTING, _MAX_WAITING, _WAIT_S = 2, 16, 60.0
@@ -212,7 +213,7 @@ class _ComputeQueue:
             if not has_turn:
                 return _fault(503, "the studio computes for other pages: try again in a moment")
             found = await run_in_threadpool(work)
-            await run_in_threadpool(release_memory)
+            found.background = BackgroundTask(release_memory)
             return found
         finally:
             if has_turn:
