@@ -178,6 +178,9 @@ def test_what_goes_wrong_half_way_is_reported_in_a_line_and_nothing_is_lost(
         shutil.rmtree(workspace / stage)
     for stage in ("images", "flight", "pool"):
         shutil.rmtree(workspace / stage / "truth", ignore_errors=True)
+        record = workspace / stage / "stage.json"  # as of before it had digests of outputs
+        values = json.loads(record.read_text()) | {"outputs": {}, "checksum": ""}
+        record.write_text(json.dumps(values))
     calibrate = [sys.executable, "-m", "alice_survey", "calibrate", "-w", str(workspace)]
     subprocess.run(calibrate, check=True, capture_output=True)  # it warns, in lines of its own
     first, *_, last = sorted((workspace / "images" / "right").glob("*.png"))

@@ -57,7 +57,7 @@ def flown_rows(reef: Path, every: int) -> NDArray[Any]:
 
 def boards(folder: Path, *, air: bool) -> None:
     """Write `air/` or `pool/`: a board before the designed cameras, at a quarter of their size."""
-    rig = design_rig(CameraConfig(), WaterConfig(), 4)
+    rig = design_rig(CameraConfig(), WaterConfig(n_water=1.3335), 4)  # fresh, as of a pool
     target = parse_target(BOARD)
     looking = in_air(rig) if air else rig
     near_m, far_m = (0.6, 1.0) if air else (0.75, 1.1)

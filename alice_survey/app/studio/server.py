@@ -91,7 +91,7 @@ _LOCKED = {
     "Referrer-Policy": "no-referrer",
     "X-Frame-Options": "DENY",
 }
-_TOKEN, _PAGE = "X-Studio-Token", "X-Studio-Page"
+_TOKEN, _NEWEST_OF = "X-Studio-Token", "X-Studio-Newest-Of"
 """Headers: the token, and a name of the page that asks."""
 _NEEDS_TOKEN = "this needs the address with its token, as the command printed it"  # noqa: S105 (a line)
 _MAX_STREAMS = 100
@@ -184,7 +184,7 @@ class _EventStream(StreamingResponse):
 
 
 class _ComputeQueue:
-    """Work of endpoints that compute: few at once, and of each page only the newest that waits."""
+    """Work of endpoints that compute: few at once, and of what a page wants the newest of, only that."""
 
     def __init__(self) -> None:
         self._places = asyncio.Semaphore(_COMPUTING)
@@ -280,7 +280,7 @@ def _route(studio: Studio, queue: _ComputeQueue, endpoint: Endpoint) -> Route:
         call = Call(query=dict(request.query_params), path=dict(request.path_params), body=body)
         work = partial(_answer, endpoint, call, request)
         if endpoint.computes:
-            return await queue.run(request.headers.get(_PAGE, ""), endpoint.path, work)
+            return await queue.run(request.headers.get(_NEWEST_OF, ""), endpoint.path, work)
         return await run_in_threadpool(work)
 
     return Route(endpoint.path, answer, methods=[endpoint.method])

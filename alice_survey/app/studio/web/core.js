@@ -18,8 +18,7 @@ export const asToken = () => (mayWrite() ? "?token=" + sessionStorage.getItem(ke
 async function asked(address, options) {
   let response = null;
   try {
-    response = await fetch(address, {
-      ...options, headers: {...options?.headers, "X-Studio-Page": PAGE}});
+    response = await fetch(address, options);
   } catch (fault) {
     if (fault.name === "AbortError") throw fault;
     throw new Error("the studio does not answer: start it again with 'alice-survey studio'");
@@ -41,21 +40,27 @@ export async function get(path, params, options) {
 export const bytes = async (path) => (await asked(path)).arrayBuffer();
 
 /* A body that is a Blob goes as it is, anything else as JSON. */
-function posted(body, signal) {
+function posted(body, headers = {}) {
   const raw = body instanceof Blob;
   return {
-    method: "POST", body: raw ? body : JSON.stringify(body), signal,
-    headers: {
+    method: "POST", body: raw ? body : JSON.stringify(body),
+    headers: {...headers,
       "Content-Type": raw ? "application/octet-stream" : "application/json",
       "X-Studio-Token": sessionStorage.getItem(key) || "",
     },
   };
 }
 
-/** @typedef {{params?: any, signal?: AbortSignal}} Options
- * @type {(path: string, body?: any, options?: Options) => Promise<any>} */
-export const send = async (path, body = {}, {params, signal} = {}) => (
-  await asked(addressOf(path, params), posted(body, signal))).json();
+export const send = async (path, body = {}, params = {}) => (
+  await asked(addressOf(path, params), posted(body))).json();
+
+/* Send what stops an older request of this page to the same path: only the newest is of use. */
+const onTheirWay = {};
+export async function sendNewest(path, body) {
+  onTheirWay[path]?.abort();
+  const {signal} = onTheirWay[path] = new AbortController();
+  return (await asked(path, {...posted(body, {"X-Studio-Newest-Of": PAGE}), signal})).json();
+}
 
 /* Save a file that the server makes. */
 export async function save(path, name, body) {

@@ -1,6 +1,8 @@
 /* The tab Model: values under the pointer, measures with their sigmas, the mesh, the files. */
 
-import {attempt, button, el, field, get, missing, save, say, send, table, asToken} from "./core.js";
+import {
+  asToken, attempt, button, el, field, get, missing, save, say, send, sendNewest, table,
+} from "./core.js";
 import {RED} from "./palette.js";
 import {counted, number, withSigma} from "./words.js";
 import {drawingTool} from "./drawing.js";
@@ -117,8 +119,7 @@ export function tab(studio) {
     const same = measures.filter((one) => one.tool === name).length + 1;
     const made = {
       id: Math.max(0, ...measures.map((one) => one.id)) + 1, name: tool.title + " " + same,
-        tool: name,
-      kind: asked.kind, places: asked.places, ...found,
+      tool: name, kind: asked.kind, places: asked.places, ...found,
     };
     measures.push(made);
     chosen = made.id;
@@ -207,7 +208,7 @@ export function tab(studio) {
       profile);
     if (one.kind === "polygon") return;
     const places = one.places.map(([east, north]) => [east, north]);
-    const found = await attempt(() => send("/api/model/profile", {places}));
+    const found = await attempt(() => sendNewest("/api/model/profile", {places}));
     if (found) profile.append(profileChart("Heights along the line with one sigma", {
       lines: [{kind: "vehicle", xs: found.along, ys: found.height, sigmas: found.sigma}],
       caption: "along the line, " + state.unit + "; height ± sigma, " + state.unit,

@@ -1,6 +1,8 @@
 /* Pictures: a spot picked in the pictures as taken, lengths with sigma, control, scale. */
 
-import {PAGE, attempt, button, el, field, get, missing, on, say, send, table} from "./core.js";
+import {
+  PAGE, attempt, button, el, field, get, missing, on, say, send, sendNewest, table,
+} from "./core.js";
 import {ORANGE} from "./palette.js";
 import {counted, number, withSigma} from "./words.js";
 import {controlForm, controlRows, mm} from "./picture_control.js";
@@ -136,14 +138,13 @@ export function tab(studio) {
   async function look() {
     const views = used();
     save.disabled = !views.length;
-    checking += 1;
-    const mine = checking;
+    const mine = checking += 1;
     if (views.length < 2) {
       spotText.textContent = views.length
         ? "Picked in one picture; two are needed." : "No spot yet.";
       return;
     }
-    const found = await send("/api/picks/position", {picks: views.map(asPick)});
+    const found = await sendNewest("/api/picks/position", {picks: views.map(asPick)});
     if (mine !== checking) return;
     const {position} = found;
     const [north, east, down] = position.sigma.map(mm);
@@ -296,9 +297,9 @@ export function tab(studio) {
       return;
     }
     lengthText.textContent = "Measuring…";
-    const found = await send("/api/picks/length", {
+    const found = await sendNewest("/api/picks/length", {
       first: picksOf(chosen[0]), second: picksOf(chosen[1])}).catch((fault) => {
-      lengthText.textContent = "No length between these two.";
+      if (fault.name !== "AbortError") lengthText.textContent = "No length between these two.";
       throw fault;
     });
     const part = (value) => (found.unit === "m" ? mm(value) + " mm" : number(value, found.unit, 2));
@@ -307,8 +308,7 @@ export function tab(studio) {
       found.unit)),
       ". Of the sigma, picks " + part(found.sigma_picks) + ", poses " + part(found.sigma_poses)
         + ", scale " + part(found.sigma_scale) + ".");
-    lengthText.dataset.value = found.value;
-    lengthText.dataset.sigma = found.sigma;
+    Object.assign(lengthText.dataset, {value: found.value, sigma: found.sigma});
     scaleBox.hidden = held.scaled_by_rig;
   }
 

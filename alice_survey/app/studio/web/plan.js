@@ -1,6 +1,6 @@
 /* The Plan tab: draw a survey, see it re-planned, save it. */
 
-import {PAGE, attempt, button, el, field, get, on, say, send, table} from "./core.js";
+import {PAGE, attempt, button, el, field, get, on, say, send, sendNewest, table} from "./core.js";
 import {AS_IN_FILE, withChange, withChanges} from "./plan_changes.js";
 import {drawing} from "./plan_draw.js";
 import {latest} from "./plan_latest.js";
@@ -57,7 +57,7 @@ export function tab(studio) {
   /* ---- Planning in the background ---- */
 
   const planning = latest({
-    ask: (state, signal) => send("/api/plan/preview", {...state, page: PAGE}, {signal}),
+    ask: (state) => sendNewest("/api/plan/preview", {...state, page: PAGE}),
     shown: settled,
     failed: (fault) => say(fault.message, "error"),
     busy(on) {
@@ -212,8 +212,8 @@ export function tab(studio) {
   function importFile(taken) {
     if (!taken) return;
     attempt(async () => {
-      const found = await send("/api/plan/import", taken, {
-        params: {name: taken.name, role: role.value}});
+      const about = {name: taken.name, role: role.value};
+      const found = await send("/api/plan/import", taken, about);
       const shapes = {...noShapes(), ...Object.fromEntries(
         Object.keys(noShapes()).map((kind) => [kind, found[kind] || []]))};
       fitted = false;

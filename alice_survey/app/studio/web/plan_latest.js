@@ -1,16 +1,12 @@
-/* Ask for the newest state only: a request waits until edits pause, stops the one on its way, and
-   no answer is shown after that of a newer request. */
-
-/* `ask(state, signal)` returns a promise; `shown(answer, state)`, `failed(error, state)` and
-   `busy(on)` are called for the newest request alone. */
+/* Ask for the newest state only: a request waits until edits pause, and no answer is shown after
+   that of a newer request. `ask(state)` returns a promise; `shown(answer, state)`,
+   `failed(error, state)` and `busy(on)` are called for the newest request alone. */
 export function latest({ask, shown, failed, busy = (_) => {}, delay = 120}) {
-  let [number, timer, onItsWay] = [0, null, null];
+  let [number, timer] = [0, null];
 
   function stop() {
     number += 1;
     clearTimeout(timer);
-    if (onItsWay) onItsWay.abort();
-    onItsWay = null;
     busy(false);
   }
 
@@ -19,15 +15,13 @@ export function latest({ask, shown, failed, busy = (_) => {}, delay = 120}) {
     const own = number;
     busy(true);
     timer = setTimeout(async () => {
-      onItsWay = new AbortController();
       let [answer, error] = [null, null];
       try {
-        answer = await ask(state, onItsWay.signal);
+        answer = await ask(state);
       } catch (fault) {
         error = fault;
       }
       if (own !== number) return;
-      onItsWay = null;
       busy(false);
       if (error) failed(error, state);
       else shown(answer, state);

@@ -1,6 +1,6 @@
 /* The first start: what shall become of this folder, a survey to plan or a model of pictures. */
 
-import {attempt, button, el, field, mayWrite, say, send} from "./core.js";
+import {attempt, button, el, field, mayWrite, say, send, sendNewest} from "./core.js";
 import {counted, duration, gigabytes, number} from "./words.js";
 
 const AREA_FILES = ".geojson,.json,.kml,.kmz,.gpkg,.zip,.wkt";
@@ -181,8 +181,8 @@ function picturesForm(started, disk) {
     const mine = asked += 1;
     take.disabled = true;
     found.replaceChildren(el("p", {}, "Looking into the folder …"));
-    const seen = await send("/api/start/preview", given()).catch((fault) => ({fault}));
-    if (mine !== asked) return;
+    const seen = await sendNewest("/api/start/preview", given()).catch((fault) => ({fault}));
+    if (mine !== asked) return;  /* of another folder, or stopped */
     questions.hidden = false;
     if (seen.fault) {
       found.replaceChildren(el("p", {class: "error"}, seen.fault.message));

@@ -78,7 +78,7 @@ def test_computing_waits_in_a_queue_of_its_own(server: Server, go_on: threading.
     began.clear()
 
     def compute(n: int, page: str = "") -> Reply:
-        return ask(server, f"/api/test/compute?n={n}", {"X-Studio-Page": page})
+        return ask(server, f"/api/test/compute?n={n}", {"X-Studio-Newest-Of": page})
 
     with ThreadPoolExecutor(64) as pool:
         working = [pool.submit(compute, n) for n in range(2)]
