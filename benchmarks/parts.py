@@ -93,7 +93,6 @@ PARTS = (
     Part(name="studio"),
     Part(name="vehicle"),
     Part(name="missions"),
-    Part(name="features", passes=("data",)),
     Part(name="refraction"),
     Part(name="bend", passes=_WORK),
     Part(name="precision", passes=_WORK, long=True),
