@@ -6,6 +6,7 @@ and a later run skips the stage while all of these are unchanged; also the resou
 versions of the packages.
 """
 
+import codecs
 import contextlib
 import csv
 import errno
@@ -612,7 +613,8 @@ def read_csv(
     """Read a CSV file with a header.
 
     Args:
-        path: the file, in UTF-8.
+        path: the file, in UTF-8, UTF-16 with its mark or Windows-1252; its cells apart by commas,
+            or by semicolons or tabs with commas or points in numbers.
         required: columns that must be there.
         exact: keep spaces at the ends of cells, which names of files may have.
         fault: type of the error.
@@ -622,8 +624,8 @@ def read_csv(
         lacks is empty.
 
     Raises:
-        AliceError: of type `fault`: the file cannot be read, lacks a column, or has a row with more
-            cells than the header.
+        AliceError: of type `fault`: the file cannot be read, lacks a column or has it twice, or has
+            a row with more cells than the header.
     """
     names, rows = stream_csv(path, required, exact=exact, fault=fault)
     return names, list(rows)
@@ -637,38 +639,60 @@ def stream_csv(
     fault: type[AliceError] = NavigationError,
 ) -> tuple[list[str], Iterator[tuple[int, dict[str, str]]]]:
     """As `read_csv`; rows are read, and what is wrong with them is found, one by one."""
-    with (
-        _csv_faults(path, fault),
-        ordinary_file(path).open(newline="", encoding="utf-8-sig") as file,
-    ):
-        first = next(csv.reader(file, skipinitialspace=not exact), [])
-    names = [name.strip() for name in first]
-    if len(names) == 1 and any(mark in names[0] for mark in ";\t"):
-        raise fault(
-            f"{path}: its cells are not apart by commas: save it as CSV with commas between cells "
-            "and points in numbers"
-        )
+    lines = _cells(path, exact=exact, fault=fault)
+    names = [name.strip() for name in next(lines, (1, []))[1]]
     missing = [name for name in required if name not in names]
+    twice = [name for name in names if name and names.count(name) > 1]
     if missing:
         raise fault(f"{path}: column {missing[0]} is missing; it has {as_line(', '.join(names))}")
+    if twice:
+        raise fault(f"{path}: column {as_line(twice[0])} stands twice")
 
     def rows() -> Iterator[tuple[int, dict[str, str]]]:
-        with (
-            _csv_faults(path, fault),
-            path.open(newline="", encoding="utf-8-sig") as file,
-        ):
-            reader = csv.reader(file, skipinitialspace=not exact)
-            for cells in itertools.islice(reader, 1, None):
-                if any(map(str.strip, cells[len(names) :])):
-                    raise fault(
-                        f"{path} line {reader.line_num}: it has more cells than the header: "
-                        "decimal commas between commas? Save numbers with points"
-                    )
-                if cells:
-                    kept = itertools.zip_longest(names, cells[: len(names)], fillvalue="")
-                    yield reader.line_num, {n: cell if exact else cell.strip() for n, cell in kept}
+        for line, cells in lines:
+            if any(map(str.strip, cells[len(names) :])):
+                raise fault(
+                    f"{path} line {line}: it has more cells than the header: decimal commas "
+                    "between commas? Save numbers with points"
+                )
+            if cells:
+                kept = itertools.zip_longest(names, cells[: len(names)], fillvalue="")
+                yield line, {n: cell if exact else cell.strip() for n, cell in kept}
 
     return names, rows()
+
+
+_DECIMAL_COMMA = re.compile(r"\s*([+-]?\d+),(\d+)\s*")
+_LOOKED_AT = 1 << 16
+
+
+def _cells(path: Path, *, exact: bool, fault: type[AliceError]) -> Iterator[tuple[int, list[str]]]:
+    """Numbers of lines and their cells, in any encoding and with any separator that tables have."""
+    with _csv_faults(path, fault):
+        with ordinary_file(path).open("rb") as raw:
+            encoding = _encoding_of(raw.read(_LOOKED_AT))
+        with path.open(newline="", encoding=encoding) as file:
+            first = file.readline()
+            named = re.fullmatch(r"sep=(.)\s*", first, re.IGNORECASE)
+            found = [mark for mark in ";\t" if mark in first and "," not in first]
+            separator = named[1] if named else (*found, ",")[0]
+            file.seek(0)
+            reader = csv.reader(file, delimiter=separator, skipinitialspace=not exact)
+            for cells in itertools.islice(reader, 1 if named else 0, None):
+                if separator != ",":
+                    cells = [_DECIMAL_COMMA.sub(r"\1.\2", cell) for cell in cells]
+                yield reader.line_num, cells
+
+
+def _encoding_of(start: bytes) -> str:
+    """The encoding of a text that begins like this, by its mark, else UTF-8 where it can be."""
+    if start.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return "utf-16"
+    try:
+        codecs.getincrementaldecoder("utf-8")().decode(start)
+    except UnicodeDecodeError:
+        return "cp1252"
+    return "utf-8-sig"
 
 
 @contextlib.contextmanager

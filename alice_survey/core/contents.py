@@ -64,6 +64,21 @@ def parse_number(text: str) -> float:
     return float(text)
 
 
+UNKNOWN = (-9999.0, -99999.0, -32767.0, -32768.0, 1e6)
+"""Numbers that stand for "not known" in tables, rasters and logs; so do those beyond `BEYOND`."""
+BEYOND = 1e30
+
+
+def is_unknown(value: float) -> bool:
+    """Whether a number stands for "not known"."""
+    return not abs(value) < BEYOND or value in UNKNOWN
+
+
+def is_nowhere(latitude_deg: float | None, longitude_deg: float | None) -> bool:
+    """Whether a place is that of a receiver without a fix."""
+    return latitude_deg == 0.0 == longitude_deg
+
+
 def parse_toml(text: str) -> dict[str, Any]:
     """The table of a TOML text.
 

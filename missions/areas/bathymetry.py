@@ -14,7 +14,7 @@ import numpy as np
 import shapely
 from shapely.geometry import MultiPolygon
 
-from alice_survey.core.contents import one_line
+from alice_survey.core.contents import BEYOND, UNKNOWN, one_line
 from alice_survey.core.errors import PlanError, warn, why
 from alice_survey.core.frames import Array, Datum
 
@@ -200,7 +200,7 @@ def read_bathymetry(
                 raise PlanError(f"{path}: names no coordinate system; give area.crs, as EPSG:32636")
             flat = _flat_wkt(file.crs.to_wkt() if file.crs else str(crs), path)
             window = _window(path, file, flat, datum, bounds_ne)
-            band = file.read(1, window=Window(*window), masked=True)
+            band = _known(path, file.read(1, window=Window(*window), masked=True))
             heights = sense == "heights" if sense != "auto" else _are_heights(path, file, band)
             scale, offset = file.scales[0], file.offsets[0]
             a, b, c, d, e, f = tuple(file.transform)[:6]
@@ -239,6 +239,26 @@ def check_raster(path: Path) -> None:
             f"{path}: is not a raster but a description of other files: give those, or make one "
             "file of them (gdal_translate)"
         )
+
+
+_SHALLOW = 0.5
+_SOME = 0.01
+
+
+def _known(path: Path, band: Any) -> Any:
+    """Values of a raster without those that stand for "not known", which it need not declare.
+
+    Zero is one where it is in a hundredth of the cells and the others are far from it.
+    """
+    zero = band == 0
+    far = np.ma.abs(band[~zero]) > _SHALLOW
+    unknown = [value for value in UNKNOWN if (band == value).any()]
+    unknown += [0.0] * bool(zero.mean() > _SOME and far.size and far.all())
+    if unknown:
+        names = " and ".join(f"{value:g}" for value in unknown)
+        warn(f"{path}: holds {names}, taken for no data, which it does not declare")
+    beyond = ~(np.abs(np.ma.filled(band, 0).astype(np.float64)) < BEYOND)
+    return np.ma.masked_where(np.isin(np.ma.filled(band, 1), unknown) | beyond, band)
 
 
 def _check_filled(path: Path, file: Any) -> None:

@@ -29,7 +29,6 @@ from alice_survey.core.contents import one_line, ordinary_file
 from alice_survey.core.errors import NavigationError, warn, why
 from alice_survey.core.frames import Array, Datum
 from missions.logs.dive import (
-    DATED_AFTER_S,
     ROLES,
     LoggedDive,
     Signal,
@@ -37,6 +36,7 @@ from missions.logs.dive import (
     clean_signal,
     usable_positions,
 )
+from missions.logs.navigation_csv import DATED_AFTER_S
 
 MAX_LOG_BYTES = 4_000_000_000
 MAGIC = b"ULog\x01\x12\x35"

@@ -16,9 +16,6 @@ from missions.logs.navigation_csv import interpolate
 
 ROLES = ("navigation", "depth", "attitude", "altitude", "velocity")
 """What of a log may be chosen by name."""
-DATED_AFTER_S = 1e8
-"""Times since 1970 before this (March 1973) are a simulation's or a processor's own clock."""
-
 _LATEST_S = 7258118400.0
 """1 January 2200."""
 _UNIT = 0.05
@@ -202,7 +199,7 @@ def usable_positions(position: Signal | None, lost: Counter[str]) -> Signal | No
     with np.errstate(invalid="ignore"):
         known = np.isfinite(latitude) & np.isfinite(longitude)
         inside = (np.abs(latitude) <= 90.0) & (np.abs(longitude) <= 180.0)
-    nowhere = known & (latitude == 0) & (longitude == 0)
+    nowhere = known & (latitude == 0) & (longitude == 0)  # as `is_nowhere` says of one
     for reason, rows in (
         ("the position is not a number", ~known),
         ("the position is beyond the range of latitude and longitude", known & ~inside),

@@ -24,8 +24,8 @@ from missions.logs.autopilot_logs import (
     read_px4_ulog,
 )
 from missions.logs.dead_reckoning import TrackErrors, with_dead_reckoning
-from missions.logs.dive import DATED_AFTER_S, ROLES, LoggedDive, Signal, of_known, rotation_of
-from missions.logs.navigation_csv import READINGS, max_gap_s, utc_date
+from missions.logs.dive import ROLES, LoggedDive, Signal, of_known, rotation_of
+from missions.logs.navigation_csv import DATED_AFTER_S, READINGS, max_gap_s, utc_date
 from missions.logs.ros_bag import is_bag, read_ros_bag
 from missions.logs.waterlinked import is_waterlinked, read_waterlinked
 from missions.values.navigation import COLUMNS, write_navigation_rows

@@ -1,10 +1,12 @@
 """A navigation log of a real dive, and what it gives at the time of each picture."""
 
+import difflib
 import itertools
 import math
+import re
 from array import array
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime, tzinfo
 from pathlib import Path
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
@@ -12,13 +14,15 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 import numpy as np
 
 from alice_survey.core.artefacts import stream_csv
-from alice_survey.core.contents import as_line, parse_number
+from alice_survey.core.contents import as_line, is_nowhere, is_unknown, parse_number
 from alice_survey.core.errors import NavigationError, warn
 from alice_survey.core.frames import Array
 from missions.values.navigation import COLUMNS
 
 POSITION, READINGS = COLUMNS[:3], COLUMNS[:7]
 """What a navigation log can measure; the other columns are sigmas."""
+IMAGE, HEIGHT = "image", "height_m"
+"""Columns of tables by picture: its name, and the height above the vertical datum."""
 TURNING = ("roll_deg", "pitch_deg", "heading_deg", "longitude_deg")
 """Columns of angles that turn the short way round."""
 _RANGES = {
@@ -26,6 +30,22 @@ _RANGES = {
     "altitude_m": (-10.0, 11_000.0), "heading_deg": (-360.0, 720.0), "roll_deg": (-360.0, 360.0),
     "pitch_deg": (-360.0, 360.0),
 }  # fmt: skip
+_USUAL: Mapping[str, str] = {
+    "latitude_deg": "latitude lat y/latitude gps_latitude gpslatitude",
+    "longitude_deg": "longitude lon long lng x/longitude gps_longitude gpslongitude",
+    "depth_m": "depth water_depth vehicle_depth",
+    "heading_deg": "heading yaw hdg compass_heading",
+    "roll_deg": "roll", "pitch_deg": "pitch",
+    "altitude_m": "altitude alt height_above_bottom range_to_bottom dvl_altitude",
+    "time_utc": "timestamp utc datetime date_time date/time time utc_time",
+    "time_s": "unix_time epoch unixtime",
+    IMAGE: "label filename file_name file image_name image_filename picture photo key",
+    HEIGHT: "z/altitude",
+}  # fmt: skip
+"""Names that other programs give to columns, without units, in lower case."""
+DATED_AFTER_S, _DATED_BEFORE_S = 1e8, 1e11
+"""Seconds between these (March 1973, 5138) count from 1970; others are of a simulation's or a
+processor's own clock."""
 _GAP_S, _GAP_INTERVALS = 2.0, 5.0
 """A gap is longer than both this many seconds and this many median intervals."""
 _FEW = 5
@@ -44,6 +64,9 @@ class NavigationLog:
     """(T,) values; NaN where a cell is empty."""
     start_utc: datetime | None
     """Date of the first row, where the log holds dates."""
+    row_of: Mapping[str, int] = field(default_factory=dict)
+    """Rows by the names of pictures, where the log has them; then `time_s` is in any order, and NaN
+    where it has no times."""
 
     @property
     def max_gap_s(self) -> float:
@@ -57,6 +80,14 @@ class NavigationLog:
         the short way round.
         """
         return {name: self._at(name, values, time_s) for name, values in self.columns.items()}
+
+    def of_pictures(self, images: Sequence[str]) -> tuple[Array, dict[str, Array]]:
+        """Times and columns, (N,) each, of pictures by name; NaN for those it does not name."""
+        keys = [next((k for k in keys_of(name) if k in self.row_of), "") for name in images]
+        rows = np.array([self.row_of.get(key, -1) for key in keys])
+        cells = {"": self.time_s, **self.columns}
+        found = {name: np.where(rows < 0, np.nan, column[rows]) for name, column in cells.items()}
+        return found.pop(""), {n: _within_turn(n, values) for n, values in found.items()}
 
     def _at(self, name: str, values: Array, at_s: Array) -> Array:
         turning = name in TURNING
@@ -140,59 +171,115 @@ def utc_date(text: str, zone: tzinfo = UTC) -> datetime:
         raise ValueError(f"{text} is not within the years 1 to 9999 in UTC") from None
 
 
+def keys_of(image: str) -> list[str]:
+    """What names a picture in a table: its path without suffix, in lower case, then its ends."""
+    parts = Path(image.strip().replace("\\", "/")).with_suffix("").as_posix().lower().split("/")
+    return ["/".join(parts[i:]) for i in range(len(parts))]
+
+
+def _usual_columns(path: Path, header: Sequence[str]) -> dict[str, str]:
+    """Names in a header by the names that they have here; a warning names what is not read.
+
+    Own names come first; then a column is that of the first usual name which it has.
+    """
+    own = (*COLUMNS, "time_s", "time_utc", IMAGE)
+    found = {name: name for name in own if name in header}
+    bare = {name: _bare(name) for name in header}
+    for name, usual in _USUAL.items():
+        for one in header:
+            if name not in found and one not in found.values() and bare[one] in usual.split():
+                found[name] = one
+    if "depth_m" in found:
+        found.pop(HEIGHT, None)
+    elif found.get("altitude_m", "altitude_m") != "altitude_m":
+        del found["altitude_m"]  # above the floor, or above the sea?
+    lost = [one for one in header if one and one not in found.values()]
+    if lost:
+        names = [name for name in (*own, *_USUAL) if name not in found]
+        near = (difflib.get_close_matches(bare[one], names, 1) for one in lost)
+        meant = dict.fromkeys(name for some in near for name in some)
+        if {"east", "north", "easting", "northing"} & set(bare.values()):
+            meant |= dict.fromkeys(("latitude_deg", "longitude_deg"))
+        hint = f"; did you mean {', '.join(meant)}?" if meant else ""
+        warn(f"{path}: not read: columns {as_line(', '.join(lost))}{hint}")
+    return found
+
+
+def _bare(name: str) -> str:
+    """A column's name without case, unit and marks."""
+    name = re.sub(r"[(\[].*", "", name).strip("# ").lower()
+    return re.sub(r"_(degrees|deg|m)$", "", re.sub(r"[\s-]+", "_", name))
+
+
 def read_navigation(
-    path: Path, zone: tzinfo, needed: Sequence[str] = POSITION, *, is_growing: bool = False
+    path: Path,
+    zone: tzinfo,
+    needed: Sequence[str] = POSITION,
+    *,
+    is_growing: bool = False,
+    by_picture: bool = False,
 ) -> NavigationLog:
     """Read a navigation CSV: `time_s` or `time_utc`, what is needed, and any other of `COLUMNS`.
 
-    A row without a finite time or a needed value, or whose time does not follow the row before, is
-    left out with a warning that names its line; of any other value only the value is left out.
+    Usual names of other programs serve too. A row without a finite time or a needed value, or whose
+    time does not follow the row before, is left out with a warning that names its line; of any
+    other value only the value is left out. What stands for "unknown" is no value.
 
     Args:
         path: the file.
         zone: of dates that name none.
         needed: columns without which a row is of no use; with none, any one value is enough.
         is_growing: the file is being written: leave out its last row, which may not be whole.
+        by_picture: a column `image` may take the place of times, or say whose times they are.
 
     Raises:
         NavigationError: the file cannot be read, lacks a column, or holds no usable row.
     """
-    header, rows = stream_csv(path, needed)
+    header, rows = stream_csv(path)
     if is_growing:
         rows = (row for row, _ in itertools.pairwise(rows))
-    clocks = [name for name in ("time_s", "time_utc") if name in header]
-    if not clocks:
-        raise NavigationError(
-            f"{path}: no column time_s or time_utc; it has {as_line(', '.join(header))}"
-        )
-    others = [name for name in COLUMNS if name in header and name not in needed]
+    at = _usual_columns(path, header)
+    named = by_picture and IMAGE in at
+    clocks = [name for name in ("time_s", "time_utc") if name in at]
+    lacks = [name for name in needed if name not in at]
+    if not clocks and not named:
+        lacks = ["time_s or time_utc" + (" or image" if by_picture else "")]
+    if lacks:
+        raise NavigationError(f"{path}: no column {lacks[0]}; it has {as_line(', '.join(header))}")
+    others = [name for name in (*COLUMNS, HEIGHT) if name in at and name not in needed]
     names = [*needed, *others]
-    if not set(names) & set(READINGS):
+    if not set(names) & {*READINGS, HEIGHT}:
         raise NavigationError(f"{path}: none of the columns {', '.join(READINGS)}")
     start_utc: datetime | None = None
-    times, table = array("d"), array("d")
+    times, table, row_of = array("d"), array("d"), dict[str, int]()
     faults: dict[str, list[int]] = {}
     for line, row in rows:
         try:
-            if clocks[0] == "time_utc":
-                date = _date(row["time_utc"], zone)
-                start_utc = start_utc or date
-                time = (date - start_utc).total_seconds()
-            else:
-                time = _number(row, "time_s")
-            values = [_number(row, name) for name in needed]
+            time = _time(row[at[clocks[0]]], clocks[0], zone) if clocks else math.nan
+            if isinstance(time, datetime):
+                start_utc = start_utc or time
+                time = (time - start_utc).total_seconds()
+            values = [_number(row[at[name]], name) for name in needed]
         except ValueError as error:
             faults.setdefault(str(error), []).append(line)
             continue
-        if times and time <= times[-1]:
+        if times and not named and time <= times[-1]:
             faults.setdefault("time does not follow that of the row before", []).append(line)
             continue
         for name in others:
             try:
-                values.append(_number(row, name) if row[name] else math.nan)
+                values.append(_number(row[at[name]], name) if row[at[name]] else math.nan)
             except ValueError as error:
                 values.append(math.nan)
                 faults.setdefault(f"{error} (that value only)", []).append(line)
+        place = [names.index(name) for name in POSITION[:2] if name in names]
+        if len(place) == 2 and is_nowhere(*(values[i] for i in place)):
+            faults.setdefault("latitude and longitude are 0, 0: no fix", []).append(line)
+            if needed:
+                continue
+            values[place[0]] = values[place[1]] = math.nan
+        if named and row_of.setdefault(keys_of(row[at[IMAGE]])[0], len(times)) != len(times):
+            raise NavigationError(f"{path} line {line}: a second row of {row[at[IMAGE]]}")
         times.append(time)
         table.extend(values)
     if faults:
@@ -205,31 +292,43 @@ def read_navigation(
         warn(f"{path}: left out {'; '.join(texts[:_NAMED])}{more}")
     cells = np.asarray(table).reshape(len(times), len(names))
     columns = {name: cells[:, i] for i, name in enumerate(names)}
+    if HEIGHT in columns:
+        columns["depth_m"] = -columns.pop(HEIGHT)
     if not any(np.isfinite(columns[name]).any() for name in READINGS if name in columns):
         what = "a position" if needed else "a reading"
         raise NavigationError(f"{path}: no row with a time and {what}")
-    return NavigationLog(time_s=np.asarray(times), columns=columns, start_utc=start_utc)
+    return NavigationLog(
+        time_s=np.asarray(times), columns=columns, start_utc=start_utc, row_of=row_of
+    )
 
 
-def _number(row: Mapping[str, str], name: str) -> float:
-    cell = row[name]
+def _number(cell: str, name: str) -> float:
     try:
         value = parse_number(cell)
     except ValueError:
         raise ValueError(f"{name} is {cell!r}, not a number") from None
-    if not math.isfinite(value):
-        raise ValueError(f"{name} is {value}")
+    if is_unknown(value):
+        raise ValueError(f"{name} is {value:g}, which stands for unknown")
     low, high = _RANGES.get(name, (-math.inf, math.inf))
     if not low <= value <= high:
         raise ValueError(f"{name} is {value}, not within {low} to {high}")
     return value
 
 
-def _date(cell: str, zone: tzinfo) -> datetime:
+def _time(cell: str, clock: str, zone: tzinfo) -> datetime | float:
+    """A time of a row: a date, also from seconds since 1970, or seconds of another clock."""
     try:
-        return utc_date(cell, zone)
+        time_s = parse_number(cell)
     except ValueError:
-        raise ValueError(f"time_utc is {cell!r}, not a date such as 2024-05-01T12:00:00Z") from None
+        try:
+            return utc_date(cell, zone)
+        except ValueError:
+            kind = "a number" if clock == "time_s" else "a date such as 2024-05-01T12:00:00Z"
+            raise ValueError(f"{clock} is {cell!r}, not {kind}") from None
+    if not math.isfinite(time_s):
+        raise ValueError(f"{clock} is {time_s}")
+    dated = DATED_AFTER_S < time_s < _DATED_BEFORE_S
+    return datetime.fromtimestamp(time_s, UTC) if dated else time_s
 
 
 def warn_of_gaps(images: Sequence[str], time_s: Array, found: Array, log: NavigationLog) -> None:

@@ -23,7 +23,6 @@ from alice_survey.core.errors import AliceError, NavigationError
 from alice_survey.core.executor import progress
 from alice_survey.core.frames import Array, Datum
 from missions.logs.dive import (
-    DATED_AFTER_S,
     LoggedDive,
     Signal,
     angles_of,
@@ -31,6 +30,7 @@ from missions.logs.dive import (
     of_known,
     usable_positions,
 )
+from missions.logs.navigation_csv import DATED_AFTER_S
 from missions.logs.ros_builder import flipped_body, flipped_quaternion, flipped_world
 
 if TYPE_CHECKING:

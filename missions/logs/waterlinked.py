@@ -19,7 +19,8 @@ import numpy as np
 
 from alice_survey.core.contents import ordinary_file
 from alice_survey.core.errors import NavigationError
-from missions.logs.dive import DATED_AFTER_S, LoggedDive, clean_signal, finite_number
+from missions.logs.dive import LoggedDive, clean_signal, finite_number
+from missions.logs.navigation_csv import DATED_AFTER_S
 
 SUFFIXES = (".json", ".jsonl", ".log", ".txt", "")
 _VELOCITY, _ATTITUDE = "velocity", "position_local"

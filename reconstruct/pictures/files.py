@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.core.contents import as_line, one_line, ordinary_file
+from alice_survey.core.contents import as_line, is_nowhere, one_line, ordinary_file
 from alice_survey.core.errors import ImageError
 from camera_calib.picture_files import (
     PILLOW_FAULTS,
@@ -269,13 +269,16 @@ def _with_exif(facts: PictureFacts) -> PictureFacts:
             device = _device(exif)
     except ImageError:
         return facts  # a RAW format that Pillow does not know, or broken tags: pixels suffice
+    latitude_deg, longitude_deg = _angle(gps, 2, 90.0), _angle(gps, 4, 180.0)
+    if is_nowhere(latitude_deg, longitude_deg):
+        latitude_deg = longitude_deg = None
     return replace(
         facts,
         time_local=time_local,
         device=device,
         orientation=orientation if orientation in range(1, 9) else 1,
-        latitude_deg=_angle(gps, 2, 90.0),
-        longitude_deg=_angle(gps, 4, 180.0),
+        latitude_deg=latitude_deg,
+        longitude_deg=longitude_deg,
         altitude_m=_altitude(gps),
     )
 

@@ -211,7 +211,7 @@ class ImportScan:
         """The navigation log."""
         if self.navigation is None:
             return None
-        return read_navigation(self.navigation, self.zone, ())
+        return read_navigation(self.navigation, self.zone, (), by_picture=True)
 
     def record(
         self,
@@ -346,7 +346,9 @@ def preview_import(
     if log is not None:
         known = [name for name, values in log.columns.items() if np.isfinite(values).any()]
         text = f"{len(log.time_s)} rows with {', '.join(known)}"
-        if log.start_utc is not None:
+        if log.row_of:
+            text += ", by names of pictures"
+        elif log.start_utc is not None:
             last = log.start_utc + timedelta(seconds=float(log.time_s[-1]))
             offset = timedelta(seconds=clock_offset_s)
             inside = sum(log.start_utc <= time + offset <= last for time in times)

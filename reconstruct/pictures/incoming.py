@@ -29,8 +29,14 @@ from alice_survey.core.records import PlaceRecord
 from camera_calib.calibrate.picture_sets import pair_pictures
 from camera_calib.picture_files import time_taken
 from camera_calib.rig import Rig
-from missions.logs.dive import DATED_AFTER_S, finite_number
-from missions.logs.navigation_csv import READINGS, NavigationLog, utc_date, warn_of_gaps
+from missions.logs.dive import finite_number
+from missions.logs.navigation_csv import (
+    DATED_AFTER_S,
+    READINGS,
+    NavigationLog,
+    utc_date,
+    warn_of_gaps,
+)
 from missions.logs.ros_bag import opened_bag
 from reconstruct.pictures.files import (
     PictureFacts,
@@ -665,11 +671,15 @@ def place_records(
 ) -> tuple[list[ImageRecord], PlaceRecord | None, str]:
     """Give records their times and positions; also the datum and the level of depths."""
     times, origin = _times(entries, log, clock_offset_s, zone)
+    named = None
+    if log is not None and log.row_of:
+        logged_s, named = log.of_pictures([str(entry.source) for entry in entries])
+        times, origin = (logged_s, "") if np.isfinite(logged_s).any() else (times, origin)
     records = [replace(r, time_s=float(t)) for r, t in zip(records, times, strict=True)]
     if log is None:
         records, level = _with_gps(records, entries), "EXIF GPS altitude"
     else:
-        if not np.isfinite(times).any():
+        if named is None and not np.isfinite(times).any():
             raise ImageError(
                 "no time of a picture is known (EXIF DateTimeOriginal, a recording's start), so "
                 "navigation cannot be tied: give times of pictures with --triggers; import each "
@@ -677,7 +687,7 @@ def place_records(
             )
         if origin:
             notes.append(f"picture times count from {origin}, plus the clock offset")
-        records, level = _with_navigation(records, times, log), logged_level
+        records, level = _with_navigation(records, times, log, named), logged_level
         depths = np.array([r.depth_m for r in records if r.readings["depth"]])
         if level == _LOGGED_LEVEL and len(depths) and np.median(depths) < -_ABOVE_M:
             warn(
@@ -686,6 +696,10 @@ def place_records(
             )
     counted = readings_of(records)
     if not counted:
+        if named is not None:
+            raise ImageError(
+                f"none of the pictures, such as {records[0].image}, is named in the navigation log"
+            )
         if log is not None:
             raise ImageError(
                 f"no picture was taken while navigation was logged: pictures at "
@@ -730,11 +744,19 @@ def _times(
 
 
 def _with_navigation(
-    records: Sequence[ImageRecord], times: Array, log: NavigationLog
+    records: Sequence[ImageRecord],
+    times: Array,
+    log: NavigationLog,
+    named: dict[str, Array] | None,
 ) -> list[ImageRecord]:
-    found = log.at(times)
+    found = log.at(times) if named is None else named
     has_reading = np.any([np.isfinite(found[name]) for name in READINGS if name in found], axis=0)
-    warn_of_gaps([r.image for r in records], times, np.where(has_reading, 1.0, np.nan), log)
+    if named is None:
+        warn_of_gaps([r.image for r in records], times, np.where(has_reading, 1.0, np.nan), log)
+    elif not has_reading.all():
+        lost = [r.image for r, known in zip(records, has_reading, strict=True) if not known]
+        warn(f"navigation names {len(records) - len(lost)} of {len(records)} pictures, not "
+             f"{list_names(lost)}")  # fmt: skip
     rows = zip(*(column.tolist() for column in found.values()), strict=True)
     return [
         replace(record, **dict(zip(found, row, strict=True))) if known else record

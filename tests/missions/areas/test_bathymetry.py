@@ -223,3 +223,12 @@ def test_points_that_span_far_more_than_they_fill(tmp_path: Path) -> None:
     path.write_text("\n".join([*rows, "900000 20 15"]) + "\n")
     with pytest.raises(PlanError, match=r"a\.xyz"):
         read_bathymetry(path, DATUM, crs=UTM, sense="depths")
+
+
+@pytest.mark.parametrize("unknown", [-9999.0, 0.0, -32768.0, 1e6, -3.4e38])
+def test_undeclared_cells_without_a_value_are_unknown(tmp_path: Path, unknown: float) -> None:
+    heights = np.full((20, 30), -12.0)
+    heights[4:9, 6:11] = unknown
+    found = read_bathymetry(_written(tmp_path / "b.tif", heights), DATUM)
+    assert (np.isnan(found.depth_m) == (heights == unknown)).all()
+    assert np.nanmax(found.depth_m) == np.nanmin(found.depth_m) == 12.0

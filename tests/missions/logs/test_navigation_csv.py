@@ -141,3 +141,66 @@ def test_each_reading_has_gaps_of_its_own(tmp_path: Path) -> None:
     )
     np.testing.assert_allclose(found["latitude_deg"], [60.125, np.nan, 62.2])
     np.testing.assert_allclose(found["depth_m"], [1.25, 15.0, 22.0])
+
+
+DATES = ["2024-07-06T10:00:00Z", "2024-07-06T10:00:05Z"]
+FOREIGN = {
+    "usual names": (",", "time_utc,lat,Longitude (deg),Depth,yaw_deg,altitude", DATES),
+    "decimal commas": (";", "Timestamp;LATITUDE;lon;depth [m];HDG;alt_m", DATES),
+    "since 1970": ("\t", "time_s\tlat\tlon\tdepth\thdg\talt", ["1720260000", "1720260005"]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16", "cp1252"])
+@pytest.mark.parametrize("kind", FOREIGN)
+def test_tables_of_other_programs_are_read(tmp_path: Path, kind: str, encoding: str) -> None:
+    mark, header, times = FOREIGN[kind]
+    rows = [[time, "60.25", "5.5", "3.5", "90", "2.25", "Épave"] for time in times]
+    text = "\n".join(mark.join(row) for row in [[*header.split(mark), "site"], *rows])
+    path = tmp_path / "n.csv"
+    path.write_text(text if mark == "," else text.replace(".", ","), encoding=encoding)
+    log = read_navigation(path, UTC)
+    assert log.start_utc == datetime(2024, 7, 6, 10, tzinfo=UTC)
+    np.testing.assert_allclose(log.time_s, [0, 5])
+    found = {name: list(values) for name, values in log.columns.items()}
+    assert found == {
+        "latitude_deg": [60.25] * 2, "longitude_deg": [5.5] * 2, "depth_m": [3.5] * 2,
+        "heading_deg": [90] * 2, "altitude_m": [2.25] * 2,
+    }  # fmt: skip
+
+
+def test_columns_that_are_not_read_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """An altitude without a depth may be above the sea."""
+    header = "time_s,depth_mm,east_m,altitude,heading_rad,roll_deg"
+    read_navigation(log_file(tmp_path, "0,60,5,1,0,2", header=header), UTC, ())
+    warned = capsys.readouterr().err
+    assert all(name in warned for name in (*header.split(",")[1:5], "depth_m", "latitude_deg"))
+    assert "roll" not in warned and warned.count("\n") == 1
+    with refused(NavigationError, "twice"):
+        read_navigation(log_file(tmp_path, "0,60,5", header="time_s,depth_m,depth_m"), UTC, ())
+
+
+@pytest.mark.parametrize("cells", ["0,0,7,3", "60,5,-9999,3", "60,5,nan,3", "60,5,1e6,3"])
+def test_what_stands_for_unknown_is_no_value(tmp_path: Path, cells: str) -> None:
+    header = "time_s,latitude_deg,longitude_deg,depth_m,altitude_m"
+    log = read_navigation(log_file(tmp_path, f"0,{cells}", header=header), UTC, ())
+    known = {name for name, values in log.columns.items() if np.isfinite(values).all()}
+    lost = {"latitude_deg", "longitude_deg"} if cells.startswith("0,0") else {"depth_m"}
+    assert known == {*header.split(",")[1:]} - lost
+
+
+def test_positions_by_the_names_of_pictures(tmp_path: Path) -> None:
+    """As Metashape exports them; a name with its folder comes before one without."""
+    header = "#Label,X/Longitude,Y/Latitude,Z/Altitude,Yaw"
+    rows = ["IMG_2.JPG,5.5,60,-3,350", "dive2\\img_1.jpg,6,61,-4,10", "IMG_1,7,62,-5,-20"]
+    log = read_navigation(log_file(tmp_path, *rows, header=header), UTC, (), by_picture=True)
+    time_s, found = log.of_pictures(["a/dive1/IMG_1.png", "dive2/IMG_1.JPG", "img_2.jpg", "IMG_3"])
+    assert np.isnan(time_s).all()
+    np.testing.assert_allclose(found["latitude_deg"], [62, 61, 60, np.nan])
+    np.testing.assert_allclose(found["depth_m"], [5, 4, 3, np.nan])
+    np.testing.assert_allclose(found["heading_deg"], [340, 10, 350, np.nan])
+    with refused(NavigationError, "second row"):
+        rows = [*rows, "img_2.png,1,1,1,1"]
+        read_navigation(log_file(tmp_path, *rows, header=header), UTC, (), by_picture=True)
