@@ -22,7 +22,7 @@ from alice_survey.app.commands.base import ReportCommand, option
 from alice_survey.core.errors import PlanError, note, warn
 from alice_survey.core.executor import local_executor
 from alice_survey.core.run import interrupts, progress
-from tests.alice_survey.app.studio.client import until
+from tests.engines import until
 
 
 class Works(ReportCommand):

@@ -154,6 +154,7 @@ def test_currents_are_across_along_and_none(small: Plan) -> None:
     assert [case.swell_m > 0 for case in cases] == [False, False, False, True]
 
 
+@pytest.mark.slow
 def test_the_report_holds_every_flight_next_to_the_paper(tmp_path: Path) -> None:
     currents = ["0.05@90", "0@0"]
     _, data = compare_report(

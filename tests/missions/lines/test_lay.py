@@ -85,9 +85,12 @@ def test_lines_of_any_area_cover_it_and_stay_inside(
         assert 0 < closing[0].length_m <= middle + 1e-9
 
 
-def test_five_hundred_areas_never_crash_and_never_leave_the_allowed_area() -> None:
+@pytest.mark.parametrize(
+    "seeds", [range(100), pytest.param(range(100, 500), marks=pytest.mark.slow)]
+)
+def test_areas_never_crash_and_lines_never_leave_the_allowed_area(seeds: range) -> None:
     unreachable = 0
-    for seed in range(500):
+    for seed in seeds:
         rng = np.random.default_rng([77, seed])
         survey = random_area(rng)
         area = area_of(survey, float(rng.choice([0.0, 0.5, 3.0])))
@@ -105,7 +108,7 @@ def test_five_hundred_areas_never_crash_and_never_leave_the_allowed_area() -> No
         fence = area.allowed.buffer(1e-6)
         assert lines
         assert all(fence.contains(as_string(line)) for line in lines)
-    assert 0 < unreachable < 250
+    assert 0 < unreachable < len(seeds) / 2
 
 
 def test_every_part_is_tied_by_cross_lines() -> None:

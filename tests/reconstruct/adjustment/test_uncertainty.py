@@ -453,6 +453,7 @@ def rms_and_scale(found: Adjusted, scene: Scene) -> tuple[float, float]:
     return rigid_rms(at, true), align_similarity(at, true).scale - 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("jump_m", [0.0, 8.0])
 def test_navigation_straightens_a_long_line_but_leaves_its_scale(
     jump_m: float, tmp_path: Path
@@ -468,6 +469,7 @@ def test_navigation_straightens_a_long_line_but_leaves_its_scale(
     assert scale.max() < 1e-3, "2 % of the log must not reach the model"
 
 
+@pytest.mark.slow
 def test_one_camera_takes_scale_and_shape_from_navigation() -> None:
     """Pictures of the left camera alone, in a unit of 0.37 m: errors are as large as stated."""
     ratios, bends = [], []

@@ -95,6 +95,7 @@ def crossed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, n
     return folder, made(folder, True)
 
 
+@pytest.mark.slow
 def test_a_body_that_crosses_is_masked(crossed: tuple[Path, dict[str, np.ndarray]]):
     folder, truth = crossed
     found = masks(folder)
@@ -119,6 +120,7 @@ def still(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_still_survey_keeps_its_pictures_whole(still: Path):
     found = masks(still)
     assert np.mean([mask.mean() for mask in found.values()]) < 5e-4

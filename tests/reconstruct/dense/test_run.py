@@ -110,6 +110,7 @@ def test_scratch_is_gone_and_files_are_there(workspace: Path):
     assert names == rasters | styles | clouds | others
 
 
+@pytest.mark.slow
 def test_an_interruption_while_a_plane_is_written_costs_nothing(
     workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

@@ -56,6 +56,7 @@ def workspace(small_survey: Path, tmp_path_factory: pytest.TempPathFactory) -> P
     return folder
 
 
+@pytest.mark.slow
 def test_places_are_where_the_series_says(workspace: Path):
     with (workspace / "sparse" / "track.csv").open(newline="") as file:
         old = list(csv.DictReader(file))
@@ -66,6 +67,7 @@ def test_places_are_where_the_series_says(workspace: Path):
     np.testing.assert_allclose(destination(CRS, frame).places(local), utm(*degrees), atol=2e-4)
 
 
+@pytest.mark.slow
 def test_heights_of_the_raster_are_those_of_the_old_one_at_the_same_places(workspace: Path):
     folder = workspace / "EPSG-32636"
     with (
@@ -93,6 +95,7 @@ def test_heights_of_the_raster_are_those_of_the_old_one_at_the_same_places(works
     assert np.percentile(np.abs(error), 95) < 2e-4
 
 
+@pytest.mark.slow
 def test_cloud_and_mesh_lie_on_the_raster(workspace: Path):
     folder = workspace / "EPSG-32636"
     with rasterio.open(folder / "dem.tif") as raster:
@@ -137,6 +140,7 @@ def seen_points(view: View, workspace: Path) -> tuple[np.ndarray, np.ndarray]:
     return points[first], local[first]
 
 
+@pytest.mark.slow
 def test_the_colmap_model_projects_to_where_the_exact_rays_land(workspace: Path):
     """The path of a pixel is found again by tracing positions through the exported resampling."""
     model = read_model(workspace / "sparse")
@@ -160,6 +164,7 @@ def test_the_colmap_model_projects_to_where_the_exact_rays_land(workspace: Path)
         assert np.percentile(one_distance, 99) > 3 * np.percentile(miss, 99)
 
 
+@pytest.mark.slow
 def test_other_programs_read_what_was_written(workspace: Path):
     folder = workspace / "undistorted"
     text, binary = (pycolmap.Reconstruction(folder / name) for name in ("sparse", "sparse/0"))

@@ -87,6 +87,7 @@ def test_sigmas_are_honest_over_many_logs() -> None:
         assert 0.75 < each < 1.3
 
 
+@pytest.mark.slow
 def test_unseen_pushes_widen_the_sigmas() -> None:
     scores = []
     for seed in range(8):
