@@ -112,10 +112,7 @@ def test_the_end_of_a_run_is_reported(
 
 @pytest.mark.parametrize("path", ["-", "FOLDER", "FILE/below", "/dev/full"])
 def test_a_file_that_cannot_be_written_ends_the_run_before_it_begins(
-    path: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    path: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("FOLDER").mkdir()

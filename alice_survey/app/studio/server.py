@@ -184,7 +184,7 @@ class _EventStream(StreamingResponse):
 
 
 class _ComputeQueue:
-    """Work of endpoints that compute: few at once, and of what a page wants the newest of, only that."""
+    """Work of endpoints that compute: few at once; of what a page wants newest, only that."""
 
     def __init__(self) -> None:
         self._places = asyncio.Semaphore(_COMPUTING)

@@ -43,10 +43,7 @@ def test_the_parts_of_the_noise_and_the_covariance_are_those_of_dense_matrices()
             pixels += together[v] * lean[:, :1] * lean[:, 1:]
     views[1].pixels["left"][2:5] = np.nan
     del views[3].pixels["right"]  # type: ignore[attr-defined]
-    freedom, shape = (
-        Freedom(free=(*of_ports(TRUTH), *pose_names(TRUTH))),
-        usual_shape(points),
-    )
+    freedom, shape = (Freedom(free=(*of_ports(TRUTH), *pose_names(TRUTH))), usual_shape(points))
     found = adjust(views, points, TRUTH, poses, freedom, shape=shape)
     problem = CalibrationProblem(
         stack_views(views, TRUTH, len(points)), points, TRUTH, freedom, shape

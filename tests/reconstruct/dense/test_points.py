@@ -4,12 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from reconstruct.dense.points import (
-    block_bounds,
-    part_in_box,
-    points_in_box,
-    points_of_pixels,
-)
+from reconstruct.dense.points import block_bounds, part_in_box, points_in_box, points_of_pixels
 from reconstruct.dense.view_store import ViewStore
 from reconstruct.pictures.undistorted import WHOLE
 from reconstruct.views.range_shift import no_shift
@@ -24,10 +19,7 @@ from tests.oracles_dense import (
 )
 
 EVERYWHERE = (-100.0, 100.0, -100.0, 100.0)
-SCENE = Scene(
-    depth_of=lambda n, e: 12.0 + 0.2 * n - 0.1 * e + 0.0 * n * e,
-    paint=position_code,
-)
+SCENE = Scene(depth_of=lambda n, e: 12.0 + 0.2 * n - 0.1 * e + 0.0 * n * e, paint=position_code)
 OFFSET = np.array([3.0, -2.0, -12.0])
 VIEW = stereo_views(np.array([0.2]), np.array([0.1]))[0]
 

@@ -7,11 +7,7 @@ import numpy as np
 import pytest
 
 from reconstruct.light.solve import GRID, LightSamples
-from reconstruct.mosaic.colour import (
-    Colour,
-    ColourModel,
-    solve_colour,
-)
+from reconstruct.mosaic.colour import Colour, ColourModel, solve_colour
 from reconstruct.mosaic.picture_measures import (
     PictureMeasures,
     ReferencePatch,

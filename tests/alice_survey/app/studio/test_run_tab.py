@@ -82,8 +82,7 @@ def test_a_fault_shows_its_line_and_the_way_on(server: Server) -> None:
 
 
 @pytest.mark.parametrize(
-    "path",
-    ["run/start", "run/stop", "start/folders", "start/preview", "start/survey"],
+    "path", ["run/start", "run/stop", "start/folders", "start/preview", "start/survey"]
 )
 def test_nothing_without_the_token(server: Server, tmp_path: Path, path: str) -> None:
     for token in (None, "wrong"):
