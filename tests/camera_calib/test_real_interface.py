@@ -23,6 +23,8 @@ from camera_calib.triangulate import Triangulation
 from tests.cameras import changed, flat_port_camera
 from tests.oracles_interface import Tank, behind_interface
 
+pytestmark = pytest.mark.slow
+
 PUBLISHED_MEDIAN_PX = 4.65
 """Of the sum of both cameras' errors: 2.13 + 2.49 px."""
 N_WATER = 1.333
@@ -169,7 +171,6 @@ def tank(aquarium: Aquarium) -> Tank:
     return aquarium.refined(np.arange(0, aquarium.pixels.shape[1], 8))
 
 
-@pytest.mark.slow
 def test_cameras_stand_above_and_before_the_tank(tank: Tank) -> None:
     top, front = (pose.inv().translation for pose in tank.poses)
     np.testing.assert_allclose(top, [0.18, 0.075, -0.198], atol=0.012)
@@ -177,7 +178,6 @@ def test_cameras_stand_above_and_before_the_tank(tank: Tank) -> None:
     assert all(0.15 < camera.parameter("port_distance_m") < 0.21 for camera in tank.cameras)
 
 
-@pytest.mark.slow
 def test_reprojection_error_is_below_the_published(aquarium: Aquarium, tank: Tank) -> None:
     held_out = np.arange(aquarium.pixels.shape[1]) % 8 != 0
 
@@ -189,14 +189,12 @@ def test_reprojection_error_is_below_the_published(aquarium: Aquarium, tank: Tan
     assert 3.5 < median_px(aquarium.by_corners().triangulate(aquarium.pixels)) < 6.5
 
 
-@pytest.mark.slow
 def test_without_refraction_the_rays_miss_each_other(aquarium: Aquarium, tank: Tank) -> None:
     in_air = replace(tank, cameras=tuple(changed(c, n_water=1.0) for c in tank.cameras))
 
     assert median_px(in_air.triangulate(aquarium.pixels)) > 10.0
 
 
-@pytest.mark.slow
 def test_points_are_near_the_authors(aquarium: Aquarium, tank: Tank) -> None:
     theirs = np.column_stack([aquarium.published[f"3d_{axis}"] for axis in "xyz"]) / 100.0
 
@@ -206,7 +204,6 @@ def test_points_are_near_the_authors(aquarium: Aquarium, tank: Tank) -> None:
     assert np.nanpercentile(apart, 90) < 0.01
 
 
-@pytest.mark.slow
 def test_the_second_clock_is_late(aquarium: Aquarium, tank: Tank) -> None:
     """Fish of the second camera, moved back by a frame or so, meet those of the first."""
     frames, ids = (aquarium.published[name].astype(np.int64) for name in ("frame", "id"))

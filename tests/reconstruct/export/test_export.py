@@ -23,6 +23,8 @@ from reconstruct.export import bilinear, destination, export_projected, export_u
 from reconstruct.pictures.undistorted import Pictures
 from reconstruct.views.model import View, read_frame, read_model, read_warps
 
+pytestmark = pytest.mark.slow
+
 CRS = "EPSG:32636"
 CENTRAL_DEG, EAST_M, SCALE = 33.0, 500_000.0, 0.9996
 
@@ -56,7 +58,6 @@ def workspace(small_survey: Path, tmp_path_factory: pytest.TempPathFactory) -> P
     return folder
 
 
-@pytest.mark.slow
 def test_places_are_where_the_series_says(workspace: Path):
     with (workspace / "sparse" / "track.csv").open(newline="") as file:
         old = list(csv.DictReader(file))
@@ -67,7 +68,6 @@ def test_places_are_where_the_series_says(workspace: Path):
     np.testing.assert_allclose(destination(CRS, frame).places(local), utm(*degrees), atol=2e-4)
 
 
-@pytest.mark.slow
 def test_heights_of_the_raster_are_those_of_the_old_one_at_the_same_places(workspace: Path):
     folder = workspace / "EPSG-32636"
     with (
@@ -95,7 +95,6 @@ def test_heights_of_the_raster_are_those_of_the_old_one_at_the_same_places(works
     assert np.percentile(np.abs(error), 95) < 2e-4
 
 
-@pytest.mark.slow
 def test_cloud_and_mesh_lie_on_the_raster(workspace: Path):
     folder = workspace / "EPSG-32636"
     with rasterio.open(folder / "dem.tif") as raster:
@@ -140,7 +139,6 @@ def seen_points(view: View, workspace: Path) -> tuple[np.ndarray, np.ndarray]:
     return points[first], local[first]
 
 
-@pytest.mark.slow
 def test_the_colmap_model_projects_to_where_the_exact_rays_land(workspace: Path):
     """The path of a pixel is found again by tracing positions through the exported resampling."""
     model = read_model(workspace / "sparse")
@@ -164,7 +162,6 @@ def test_the_colmap_model_projects_to_where_the_exact_rays_land(workspace: Path)
         assert np.percentile(one_distance, 99) > 3 * np.percentile(miss, 99)
 
 
-@pytest.mark.slow
 def test_other_programs_read_what_was_written(workspace: Path):
     folder = workspace / "undistorted"
     text, binary = (pycolmap.Reconstruction(folder / name) for name in ("sparse", "sparse/0"))
