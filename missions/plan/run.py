@@ -7,7 +7,6 @@ the cameras open and goes out after they close, by its lead.
 
 import math
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +17,8 @@ from alice_survey.core.config import SurveyConfig
 from alice_survey.core.errors import PlanError
 from alice_survey.core.executor import Executor
 from alice_survey.core.run import progress
-from camera_calib.rig import Rig, design_rig
-from missions.plan.planner import Planned, plan_survey
+from camera_calib.rig import design_rig
+from missions.plan.planner import plan_survey
 from missions.plan.rows import settings_table
 from missions.values.costs import Costs, leg_costs
 from missions.values.plan_file import Dive, Plan
@@ -51,29 +50,20 @@ def run_plan(
     write_json(folder / "certificate.json", planned.certificate.to_json())
     (folder / "settings.txt").write_text(settings_table(planned.rows) + "\n", encoding="utf-8")
     write_triggers(folder, plan, planned.costs, planned.imaging.shortest_interval_s)
-    return partial(write_maps_and_missions, folder, planned, rig, survey)
 
+    @progress.step("write maps and missions")
+    def write_maps_and_missions() -> None:
+        from alice_survey.kit.figure import save_figure
+        from missions.exports.format import options_of
+        from missions.exports.write import write_exports
+        from missions.plan.map import plan_figure
 
-@progress.step("write maps and missions")
-def write_maps_and_missions(folder: Path, planned: Planned, rig: Rig, survey: SurveyConfig) -> None:
-    """Write what people look at and vehicles load.
+        figure = plan_figure(plan, rig, planned.certificate, planned.bathymetry, survey.sea)
+        save_figure(figure, folder / "map.png")
+        options = options_of(survey.camera, survey.plan, survey.vehicle, survey.sea)
+        write_exports(folder / EXPORTS, plan, rig, options=options)
 
-    Args:
-        folder: of the stage.
-        planned: the plan and what led to it.
-        rig: its cameras in water.
-        survey: the settings, for the current that maps show and for what vehicles need.
-    """
-    from alice_survey.kit.figure import save_figure
-    from missions.exports.format import options_of
-    from missions.exports.write import write_exports
-    from missions.plan.map import plan_figure
-
-    plan = planned.plan
-    figure = plan_figure(plan, rig, planned.certificate, planned.bathymetry, survey.sea)
-    save_figure(figure, folder / "map.png")
-    options = options_of(survey.camera, survey.plan, survey.vehicle, survey.sea)
-    write_exports(folder / EXPORTS, plan, rig, options=options)
+    return write_maps_and_missions
 
 
 def write_triggers(folder: Path, plan: Plan, costs: Costs, shortest_interval_s: float) -> None:
