@@ -1,12 +1,15 @@
-# Two commands do all the set-up they need: make demo, make test.
+# Each command installs what it needs: demo what a user needs, test what a developer needs, the rest all.
 PYTHON ?= python3
 BIN := .venv/bin
-READY := .venv/ready
+INSTALL := $(shell command -v uv >/dev/null && echo uv pip install --python $(BIN)/python || \
+	echo $(BIN)/pip install --disable-pip-version-check --no-compile) --quiet --no-deps
+COMPILE := $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes \
+	--no-emit-index-url --no-annotate --no-header pyproject.toml
 WORKSPACE ?= demo
 WORKERS ?= 2
 WORK ?= build/benchmarks
 
-.PHONY: help setup demo test test-slow test-all bench docs lint types imports structure lint-js check lock clean
+.PHONY: help demo test test-slow test-all bench docs lint types imports structure lint-js check lock clean
 
 help:
 	@echo "make demo    plan, fly, image, reconstruct and score a small survey into $(WORKSPACE)/"
@@ -15,48 +18,51 @@ help:
 	@echo "make bench   run all benchmarks, for hours; table, logs and workspaces go into $(WORK)/"
 	@echo "make docs    build the site of docs/ into build/site/"
 	@echo "make check   lint (Python and JavaScript), types, import rules, and the bounds of make structure"
-	@echo "make lock    renew requirements.lock from pyproject.toml"
+	@echo "make lock    renew locks/ from pyproject.toml: demo.lock, test.lock and all.lock"
 
-setup: $(READY)
+# Each lock contains the one before it.
+WITHIN_demo := demo
+WITHIN_test := demo test
+WITHIN_all := demo test all
 
-$(READY): requirements.lock pyproject.toml .ci/system-libraries
+.venv/%.ready: locks/%.lock pyproject.toml .ci/system-libraries
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 		{ echo "error: Python 3.11 or newer is needed; set PYTHON=/path/to/python3.11" >&2; exit 1; }
 	@PYTHON=$(PYTHON) sh .ci/system-libraries
-	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
-	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
-	@touch $@
+	[ -x $(BIN)/python ] || $(PYTHON) -m venv .venv
+	$(INSTALL) --require-hashes -r $<
+	$(INSTALL) --no-build-isolation -e .
+	@touch $(WITHIN_$*:%=.venv/%.ready)
 
-demo: $(READY)
+demo: .venv/demo.ready
 	$(BIN)/alice-survey demo -w $(WORKSPACE)
 
-test: $(READY)
+test: .venv/test.ready
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup -m "not slow"
 
-test-slow: $(READY)
+test-slow: .venv/all.ready
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup -m slow
 
-test-all: $(READY)
+test-all: .venv/all.ready
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup
 
-bench: $(READY)
+bench: .venv/all.ready
 	$(BIN)/python -m benchmarks --work $(WORK)
 
-docs: $(READY)
+docs: .venv/all.ready
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 
-lint: $(READY)
+lint: .venv/test.ready
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
-types: $(READY)
+types: .venv/test.ready
 	$(BIN)/mypy
 
-imports: $(READY)
+imports: .venv/test.ready
 	$(BIN)/lint-imports
 
-structure: $(READY)
+structure: .venv/test.ready
 	$(BIN)/python -m tests.structure
 
 node_modules/.package-lock.json: package-lock.json
@@ -67,9 +73,10 @@ lint-js: node_modules/.package-lock.json
 
 check: lint types imports lint-js structure
 
-lock: $(READY)
-	$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --extra dev --extra docs --extra bench \
-		--generate-hashes --no-emit-index-url --no-annotate --no-header pyproject.toml -o requirements.lock
+lock: .venv/test.ready
+	$(COMPILE) --extra slow -o locks/all.lock
+	$(COMPILE) --extra dev -c locks/all.lock -o locks/test.lock
+	$(COMPILE) --extra studio -c locks/all.lock -o locks/demo.lock
 
 clean:
 	rm -rf .venv demo

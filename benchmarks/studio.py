@@ -147,7 +147,7 @@ def replan_figures(area: str, settings: dict[str, dict[str, Any]], scale: float)
             raise RuntimeError(found["error"])
     with tempfile.TemporaryDirectory() as folder, collected_by(lambda _, __: None):
         began = time.process_time()
-        run_plan(Path(folder), Path(folder), SERIAL, survey=draft.config)
+        run_plan(Path(folder), Path(folder), SERIAL, survey=draft.config)()
         whole_s = time.process_time() - began
     cpu_s = float(np.median(times_s[1:]))
     maximum = {"tutorial": 0.5, "10,000 swaths": 2.0}.get(area, math.inf)

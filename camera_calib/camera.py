@@ -53,11 +53,6 @@ class Camera:
             raise CalibrationError(f"camera: a size or focal length exceeds {MAX_PX:g} px")
 
     @property
-    def optics(self) -> optics.Optics:
-        """Lens and port as kernels take them."""
-        return self.lens.kind, self.lens.values, self.port.kind, self.port.values
-
-    @property
     def fx_px(self) -> float:
         """Focal length along the rows, in air."""
         return self.lens.fx_px
@@ -141,7 +136,7 @@ class Camera:
             model folds back.
         """
         points = np.ascontiguousarray(points_cam, dtype=np.float64)
-        pixels: Array = optics.project(points.reshape(-1, 3), self.optics)
+        pixels: Array = optics.project(points.reshape(-1, 3), self.lens, self.port)
         return pixels.reshape(*points.shape[:-1], 2)
 
     def project_jacobian(self, points_cam: Array) -> tuple[Array, Array, Array]:
@@ -155,15 +150,14 @@ class Camera:
             `parameters`, (..., 2, P). NaN where `project` is.
         """
         points = np.ascontiguousarray(points_cam, dtype=np.float64)
-        of_lens, of_port = len(self.lens.parameters), len(self.port.parameters)
         pixels, by_point, by_parameter = optics.project_jacobian(
-            points.reshape(-1, 3), self.optics, of_lens, of_port
+            points.reshape(-1, 3), self.lens, self.port
         )
         shape = points.shape[:-1]
         return (
             pixels.reshape(*shape, 2),
             by_point.reshape(*shape, 2, 3),
-            by_parameter.reshape(*shape, 2, of_lens + of_port),
+            by_parameter.reshape(*shape, 2, len(self.parameters)),
         )
 
     def unproject(self, pixels: Array) -> tuple[Array, Array]:
@@ -178,7 +172,7 @@ class Camera:
             inverse or light is totally reflected.
         """
         array = np.ascontiguousarray(pixels, dtype=np.float64)
-        points, directions = optics.unproject(array.reshape(-1, 2), self.optics)
+        points, directions = optics.unproject(array.reshape(-1, 2), self.lens, self.port)
         shape = (*array.shape[:-1], 3)
         return points.reshape(shape), directions.reshape(shape)
 

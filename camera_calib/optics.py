@@ -1,31 +1,41 @@
 """Points to pixels and back through any lens and port: the one entry for all kernels.
 
-A camera comes as one value, `Optics`: the kind of its lens with the lens's values, and the kind of
-its port with the port's. A new lens or port is one file, and one branch in each function here.
-Rows without a solution are NaN.
+A new lens or port is one file, and its kernels in `_OF_LENS` or `_OF_PORT`; those of cameras that a
+process meets are compiled. Rows without a solution are NaN.
 """
+
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 
-from alice_survey.core.compiled import BLOCK as _BLOCK
-from alice_survey.core.compiled import compiled, compiled_ieee
 from alice_survey.core.frames import Array
 from camera_calib.lenses.fisheye import FisheyeLens, fisheye_pixels, fisheye_rays, fisheye_slopes
 from camera_calib.lenses.opencv import OpenCVLens, opencv_pixels, opencv_rays, opencv_slopes
 from camera_calib.lenses.values import LensValues
 from camera_calib.ports.dome import DomePort, dome_leave, dome_rays, dome_slopes
 from camera_calib.ports.flat import FlatPort, flat_leave, flat_rays, flat_slopes
-from camera_calib.ports.none import NoPort, bare_leave, bare_rays
+from camera_calib.ports.none import NoPort, bare_leave, bare_rays, bare_slopes
 from camera_calib.ports.values import PortValues
 
-Optics = tuple[int, Array, int, Array]
-"""Kind and values of a lens, kind and values of a port."""
 LENSES: dict[str, type[LensValues]] = {lens.model: lens for lens in (OpenCVLens, FisheyeLens)}
 PORTS: dict[str, type[PortValues]] = {port.shape: port for port in (NoPort, FlatPort, DomePort)}
 _BETWEEN = 1.17
 """Between the ratio of focal lengths of a dome, 1, and that of a flat port, the water's index."""
-_FISHEYE = FisheyeLens.kind
-_FLAT, _DOME = FlatPort.kind, DomePort.kind
+_Kernel = Callable[..., Any]
+_OF_LENS: dict[type[LensValues], tuple[_Kernel, _Kernel, _Kernel]] = {
+    OpenCVLens: (opencv_pixels, opencv_rays, opencv_slopes),
+    FisheyeLens: (fisheye_pixels, fisheye_rays, fisheye_slopes),
+}
+"""Pixels of rays in air, the inverse, and pixels with their slopes."""
+_OF_PORT: dict[type[PortValues], tuple[_Kernel, _Kernel, _Kernel]] = {
+    NoPort: (bare_rays, bare_leave, bare_slopes),
+    FlatPort: (flat_rays, flat_leave, flat_slopes),
+    DomePort: (dome_rays, dome_leave, dome_slopes),
+}
+"""Rays in air of points, the inverse for rays, and slopes by points of those by rays."""
+_BLOCK = 4096
+"""Points at a time: their rays stay in the processor's cache."""
 
 
 def likely_port(focal_ratio: float) -> str:
@@ -39,95 +49,51 @@ def contradicting_port(focal_ratio: float, given: str) -> str | None:
     return likely if likely != given and FlatPort.shape in (likely, given) else None
 
 
-@compiled_ieee
-def _air_rays(points: Array, port_kind: int, port: Array, rays: Array, turns: Array) -> None:
-    if port_kind == _FLAT:
-        flat_rays(points, port, rays, turns)
-    elif port_kind == _DOME:
-        dome_rays(points, port, rays, turns)
-    else:
-        bare_rays(points, rays)
+def _blocks(count: int) -> Iterator[tuple[slice, int]]:
+    """Parts of so many rows, and how many each has."""
+    for first in range(0, count, _BLOCK):
+        end = min(first + _BLOCK, count)
+        yield slice(first, end), end - first
 
 
-@compiled_ieee
-def _pixels(rays: Array, lens_kind: int, lens: Array, pixels: Array) -> None:
-    if lens_kind == _FISHEYE:
-        fisheye_pixels(rays, lens, pixels)
-    else:
-        opencv_pixels(rays, lens, pixels)
-
-
-@compiled(nogil=True, error_model="numpy")
-def project(points: Array, optics: Optics) -> Array:
+def project(points: Array, lens: LensValues, port: PortValues) -> Array:
     """(N, 2) pixels of (N, 3) points."""
-    lens_kind, lens, port_kind, port = optics
-    pixels = np.empty((points.shape[0], 2))
-    rays, turns = np.empty((_BLOCK, 3)), np.empty(_BLOCK)
-    for first in range(0, points.shape[0], _BLOCK):
-        block = points[first : first + _BLOCK]
-        _air_rays(block, port_kind, port, rays, turns)
-        _pixels(rays[: len(block)], lens_kind, lens, pixels[first : first + _BLOCK])
+    pixels, size = np.empty((len(points), 2)), min(len(points), _BLOCK)
+    air, turns = np.empty((size, 3)), np.empty(size)
+    for part, count in _blocks(len(points)):
+        _OF_PORT[type(port)][0](points[part], port.values, air[:count], turns)
+        _OF_LENS[type(lens)][0](air[:count], lens.values, pixels[part])
     return pixels
 
 
-@compiled(nogil=True, error_model="numpy")
-def unproject(pixels: Array, optics: Optics) -> tuple[Array, Array]:
+def unproject(pixels: Array, lens: LensValues, port: PortValues) -> tuple[Array, Array]:
     """Points on the outer surface and unit directions in water, (N, 3) each, of (N, 2) pixels."""
-    lens_kind, lens, port_kind, port = optics
-    points = np.empty((pixels.shape[0], 3))
-    directions = np.empty((pixels.shape[0], 3))
-    air = np.empty((_BLOCK, 3))
-    for first in range(0, pixels.shape[0], _BLOCK):
-        block = pixels[first : first + _BLOCK]
-        rays = air[: len(block)]
-        if lens_kind == _FISHEYE:
-            fisheye_rays(block, lens, rays)
-        else:
-            opencv_rays(block, lens, rays)
-        starts, ways = points[first : first + _BLOCK], directions[first : first + _BLOCK]
-        if port_kind == _FLAT:
-            flat_leave(rays, port, starts, ways)
-        elif port_kind == _DOME:
-            dome_leave(rays, port, starts, ways)
-        else:
-            bare_leave(rays, starts, ways)
+    points, directions = np.empty((2, len(pixels), 3))
+    air = np.empty((min(len(pixels), _BLOCK), 3))
+    for part, count in _blocks(len(pixels)):
+        _OF_LENS[type(lens)][1](pixels[part], lens.values, air[:count])
+        _OF_PORT[type(port)][1](air[:count], port.values, points[part], directions[part])
     return points, directions
 
 
-@compiled(nogil=True, error_model="numpy")
 def project_jacobian(
-    points: Array, optics: Optics, of_lens: int, of_port: int
+    points: Array, lens: LensValues, port: PortValues
 ) -> tuple[Array, Array, Array]:
-    """Pixels (N, 2) with their slopes by point (N, 2, 3) and by parameter (N, 2, P).
+    """Pixels (N, 2) of points (N, 3), with their slopes by point and by parameter.
 
-    Args:
-        points: (N, 3).
-        optics: of the camera.
-        of_lens: parameters of the lens, which come first in P.
-        of_port: parameters of the port.
+    Returns:
+        (N, 2), (N, 2, 3) and (N, 2, P), of which the lens's parameters come first.
     """
-    lens_kind, lens, port_kind, port = optics
-    count = points.shape[0]
-    pixels = np.empty((count, 2))
-    by_point = np.empty((count, 2, 3))
-    by_parameter = np.empty((count, 2, of_lens + of_port))
-    air, turns, by_air = np.empty((_BLOCK, 3)), np.empty(_BLOCK), np.empty((_BLOCK, 2, 3))
-    for first in range(0, count, _BLOCK):
-        end = min(first + _BLOCK, count)
-        block, rays, by_ray = points[first:end], air[: end - first], by_air[: end - first]
-        by_lens, by_port = (
-            by_parameter[first:end, :, :of_lens],
-            by_parameter[first:end, :, of_lens:],
-        )
-        _air_rays(block, port_kind, port, rays, turns)
-        if lens_kind == _FISHEYE:
-            fisheye_slopes(rays, lens, pixels[first:end], by_ray, by_lens)
-        else:
-            opencv_slopes(rays, lens, pixels[first:end], by_ray, by_lens)
-        if port_kind == _FLAT:
-            flat_slopes(block, turns, port, by_ray, by_point[first:end], by_port)
-        elif port_kind == _DOME:
-            dome_slopes(block, turns, port, by_ray, by_point[first:end], by_port)
-        else:
-            by_point[first:end] = by_ray
-    return pixels, by_point, by_parameter
+    count, of_lens, of_port = len(points), _OF_LENS[type(lens)], _OF_PORT[type(port)]
+    pixels, by_point, by_ray = (
+        np.empty((count, 2)),
+        np.empty((count, 2, 3)),
+        np.empty((count, 2, 3)),
+    )
+    by_lens = np.empty((count, 2, len(lens.parameters)))
+    by_port = np.empty((count, 2, len(port.parameters)))
+    rays, turns = np.empty((count, 3)), np.empty(count)
+    of_port[0](points, port.values, rays, turns)
+    of_lens[2](rays, lens.values, pixels, by_ray, by_lens)
+    of_port[2](points, turns, port.values, by_ray, by_point, by_port)
+    return pixels, by_point, np.concatenate([by_lens, by_port], axis=2)

@@ -1,11 +1,26 @@
-"""Engines that executors can run tasks on, as those for many machines would."""
+"""Engines that executors can run tasks on, and how a test waits for what others do.
+
+Tasks in other processes import the module of their test: what this imports is paid for by each.
+"""
 
 import pickle
+import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 from alice_survey.core.executor import Executor
+
+T = TypeVar("T")
+
+
+def until(look: Callable[[], T | None], within_s: float = 60.0) -> T:
+    """The first thing seen that counts as true."""
+    end_s = time.monotonic() + within_s
+    while not (found := look()):
+        assert time.monotonic() < end_s, f"it did not happen: {found}"
+        time.sleep(0.05)
+    return found
 
 
 class PicklingThreads:

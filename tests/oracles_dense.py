@@ -324,10 +324,7 @@ def sparse_model(views: list[View], scene: Scene, points: int = 400, seed: int =
 
 
 def write_workspace(
-    folder: Path,
-    views: list[View],
-    scene: Scene,
-    world_from_scene: RigidTransform | None = None,
+    folder: Path, views: list[View], scene: Scene, world_from_scene: RigidTransform | None = None
 ) -> Path:
     """A workspace with finished `images` and `sparse` stages.
 

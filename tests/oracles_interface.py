@@ -30,10 +30,7 @@ SIZE_M = np.array([0.40, 0.21, 0.20])
 
 
 def triangulate_slowly(
-    cameras: Sequence[Camera],
-    poses: Sequence[RigidTransform],
-    pixels: Array,
-    start: Array,
+    cameras: Sequence[Camera], poses: Sequence[RigidTransform], pixels: Array, start: Array
 ) -> Array:
     """One point of least squared reprojection error, by scipy with numeric slopes."""
 
@@ -92,10 +89,7 @@ def behind_interface(
     normal = np.linalg.svd(points_cam - middle)[2][2]
     normal *= np.sign(normal @ middle)
     return changed(
-        lens,
-        n_water=n_water,
-        glass_thickness_m=glass_m,
-        port_distance_m=float(normal @ middle),
+        lens, n_water=n_water, glass_thickness_m=glass_m, port_distance_m=float(normal @ middle)
     ).with_parameters({"normal_x": float(normal[0]), "normal_y": float(normal[1])})
 
 

@@ -303,8 +303,7 @@ ALICE = Geometry(
         outline=_POD.stretch(_POD.tail_x_m + _MOVED_M, _POD.nose_x_m + _MOVED_M)
     ),
     mount=SPARUS2.mount._replace(
-        aft_x_m=SPARUS2.mount.aft_x_m + _MOVED_M,
-        fore_x_m=SPARUS2.mount.fore_x_m + _MOVED_M,
+        aft_x_m=SPARUS2.mount.aft_x_m + _MOVED_M, fore_x_m=SPARUS2.mount.fore_x_m + _MOVED_M
     ),
     # "At the farthest possible distance" (paper, section III.A); T200 propellers of 0.076 m.
     tunnels=(

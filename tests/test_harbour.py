@@ -25,20 +25,8 @@ from benchmarks.harbour_masks import MaskTask, count_pixels, fish_in, shadow_in,
 from benchmarks.harbour_meshes import moving_at, still_harbour
 from benchmarks.harbour_scene import FISH, PARTS, Ellipsoid
 from benchmarks.harbour_sight import instants_that_see, surface_samples, trace
-from benchmarks.harbour_survey import (
-    body_poses,
-    harbour_rig,
-    quick_stations,
-    stations,
-    time_of,
-)
-from benchmarks.harbour_truth import (
-    clearance,
-    distances,
-    moving_distance,
-    normals,
-    solid_distance,
-)
+from benchmarks.harbour_survey import body_poses, harbour_rig, quick_stations, stations, time_of
+from benchmarks.harbour_truth import clearance, distances, moving_distance, normals, solid_distance
 from camera_calib.camera import Camera
 
 QUICK = tuple(quick_stations())

@@ -186,10 +186,7 @@ def test_what_goes_wrong_half_way_is_reported_in_a_line_and_nothing_is_lost(
     first, *_, last = sorted((workspace / "images" / "right").glob("*.png"))
     kept = tmp_path / last.name
     shutil.copy2(last, kept)
-    for step, spoil in (
-        ("features", last.unlink),
-        ("matching", lambda: shutil.copy(first, last)),
-    ):
+    for step, spoil in (("features", last.unlink), ("matching", lambda: shutil.copy(first, last))):
         seen = events.stat().st_size if events.exists() else 0
         run = reconstruct(workspace, "--log-file", str(events))
         assert wait_for(run, events, seen, event="step_started", step=step)

@@ -1,19 +1,15 @@
-"""What `python -m tests.structure` counts stays within its bounds, and is noticed where not."""
+"""What `python -m tests.structure` counts is noticed where it is too much; `make check` counts."""
 
 import shutil
 import subprocess
 import sys
+from contextlib import nullcontext
+from itertools import cycle
 from pathlib import Path
 
 import pytest
 
-from tests import structure
-
-
-@pytest.mark.parametrize("name", structure.BOUNDS)
-def test_a_count_stays_within_its_bound(name: str) -> None:
-    count = next(count for count in structure.counts() if count.name == name)
-    assert count.value <= count.maximum, count.places
+from tests import conftest, structure
 
 
 def excess(name: str) -> int:
@@ -122,3 +118,24 @@ def test_lines_of_code_are_neither_blank_nor_comments_nor_docstrings(text: str, 
 )
 def test_circles_are_found(graph: dict[str, set[str]], rings: list[list[str]]) -> None:
     assert structure.circles(graph) == rings
+
+
+@pytest.mark.parametrize(
+    ("spent_s", "compiles", "marks", "fails"),
+    [(9.0, 0, (), 0), (11.0, 0, (), 1), (11.0, 1, (), 0), (11.0, 0, ("slow",), 0)],
+)
+def test_a_daily_test_that_takes_long_fails(
+    spent_s: float, compiles: bool, marks: tuple[str, ...], fails: bool,
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, request: pytest.FixtureRequest,
+) -> None:  # fmt: skip
+    item = pytest.Function.from_parent(request.node.parent, name="f", callobj=excess)
+    for mark in marks:
+        item.add_marker(mark)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(conftest, "_cpu_s", cycle((1.0, 1.0 + spent_s)).__next__)
+    if compiles:
+        (tmp_path / "kernel.nbi").touch()
+    call = conftest.pytest_runtest_call(item)
+    next(call)
+    with pytest.raises(pytest.fail.Exception, match=r"11\.0 CPU s") if fails else nullcontext():
+        list(call)

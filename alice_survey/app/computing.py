@@ -19,7 +19,6 @@ from alice_survey.core.executor import default_threads
 from alice_survey.core.manifest import read_manifest
 from alice_survey.core.run.resources import processor
 from alice_survey.kit.words import count, digits, duration
-from reconstruct.dense.matching_trial import scale_for_cell
 
 OTHER_CORES = 16
 _CAMERAS = 2
@@ -96,7 +95,11 @@ def size_of(
     """
     scale = settings.dense_scale
     if scale is None:
-        scale = 1.0 if pixel_m is None else scale_for_cell(settings.dem_cell_m, pixel_m)
+        scale = 1.0
+        if pixel_m is not None and settings.dem_cell_m is not None:
+            from reconstruct.dense.matching_trial import scale_for_cell
+
+            scale = scale_for_cell(settings.dem_cell_m, pixel_m)
     return SurveySize(
         pictures=pictures, mpx=mpx, refined_mpx=mpx * scale**2, board_pictures=board_pictures
     )

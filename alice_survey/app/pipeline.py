@@ -4,8 +4,9 @@ import contextlib
 import json
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,7 +28,7 @@ from alice_survey.core.errors import ConfigError, WorkspaceError, warn
 from alice_survey.core.executor import Executor, local_executor
 from alice_survey.core.run import progress
 from alice_survey.core.settings_form import settings_template
-from alice_survey.core.stages import is_imported
+from alice_survey.core.stages import StageSpec, is_imported
 
 if TYPE_CHECKING:
     from alice_survey.core.settings_text import Values
@@ -42,6 +43,7 @@ def run(
     *,
     edited_mission: bool = False,
     stops: bool = False,
+    say: Callable[[str, Path], object] = lambda text, folder: None,
 ) -> tuple[str, dict[str, Any]]:
     """Run stages one after the other; those that are up to date are skipped.
 
@@ -53,6 +55,7 @@ def run(
         changes: settings by section for this run alone; those that are None stay as they are.
         edited_mission: fly a mission that was edited since it was exported.
         stops: end after a stage whose result is not good enough.
+        say: takes the text of a result and the unfinished folder, before figures are drawn.
 
     Returns:
         Results of each stage, as text and as JSON values.
@@ -82,6 +85,10 @@ def run(
                 )
     from alice_survey.app.computing import task_memory_mib
 
+    def say_result(stage: StageSpec, folder: Path) -> None:
+        text = stage.summary(folder)[0].replace(str(folder), str(workspace / stage.folder))
+        say(f"{stage.name}: {text}", folder)
+
     lines, found = [], {}
     executor = executor or local_executor()
     with only_one(workspace):
@@ -106,7 +113,8 @@ def run(
                 task_mib = task_memory_mib(
                     stage.name, workspace, config.camera, config.imaging, config.reconstruct
                 )
-                done = stage.make(workspace, config, replace(executor, task_mib=task_mib))
+                executor = replace(executor, task_mib=task_mib)
+                done = stage.make(workspace, config, executor, partial(say_result, stage))
             text, data = stage.summary(workspace / stage.folder)
             found[stage.name] = {"done": done, **data}
             lines.append(f"{stage.name}: {text}" if done else f"{stage.name}: (up to date) {text}")
@@ -126,24 +134,31 @@ def plan_report(
     *,
     every_setting: bool = False,
     vehicle: str | None = None,
+    say: Callable[[str], object] = lambda text: None,
 ) -> tuple[str, dict[str, Any]]:
     """Plan a survey, and show its main settings; or every one with its equation and limit.
 
     A vehicle by name or file counts for this plan instead of the survey's.
 
-    What imaging and reconstruction will take on this machine follows.
+    What imaging and reconstruction will take on this machine follows. `say` takes what comes
+    before it as soon as the plan is known.
     """
     from alice_survey.app.computing import GROUPS
     from missions.plan.rows import main_settings
 
-    text, found = run(["plan"], workspace, survey, changes={"vehicle": {"name": vehicle}})
+    def with_settings(text: str, folder: Path) -> str:
+        if every_setting:
+            table = (folder / "settings.txt").read_text(encoding="utf-8")
+        else:
+            table = main_settings(read_json(folder / "plan.json"))
+        return f"{table}\n{text}"
+
+    text, found = run(
+        ["plan"], workspace, survey, changes={"vehicle": {"name": vehicle}},
+        say=lambda text, folder: say(with_settings(text, folder)),
+    )  # fmt: skip
     cost, found["cost"] = _predict_cost(workspace, survey, GROUPS)
-    folder = workspace / "plan"
-    if every_setting:
-        table = (folder / "settings.txt").read_text(encoding="utf-8")
-    else:
-        table = main_settings(read_json(folder / "plan.json"))
-    return f"{table}\n{text}\n{cost}", found
+    return f"{with_settings(text, workspace / 'plan')}\n{cost}", found
 
 
 def _predict_cost(

@@ -22,8 +22,6 @@ from numba.core.compiler_lock import global_compiler_lock
 from alice_survey.core.errors import note
 from alice_survey.core.run.resources import user_lock
 
-BLOCK = 128
-"""Points at a time: loops over a block that do not branch become vector instructions."""
 _MAX_WAIT_S = 120.0
 """For another process that compiles the same kernel."""
 _Arguments = ParamSpec("_Arguments")
@@ -64,8 +62,11 @@ def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
 
 
 def compiled_ieee(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """The same, where a division by zero gives infinity or NaN as in numpy, without a check."""
-    kernel: Callable[_Arguments, _Result] = compiled(error_model="numpy")(function)
+    """The same, where a division by zero gives infinity or NaN as in numpy, without a check.
+
+    Other threads run meanwhile.
+    """
+    kernel: Callable[_Arguments, _Result] = compiled(error_model="numpy", nogil=True)(function)
     return kernel
 
 

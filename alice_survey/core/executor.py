@@ -20,6 +20,8 @@ from alice_survey.core.run.progress import TaskSpent, current, step
 _PR_SET_PDEATHSIG = 1
 _MESSAGES = "messages_of_task"
 _CORES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+_MAX_COUNTED = 1000
+"""Times that one step is counted on: a count takes as long as writing a message of a bag."""
 _QUEUED = 3
 """Tasks in flight for each one running: enough to keep all busy, few enough to bound memory."""
 
@@ -372,6 +374,11 @@ def progress(items: Iterable[Item], label: str, total: int | None = None) -> Ite
     if total is None and isinstance(items, Sized):
         total = len(items)
     with step(label, total) as counter:
-        for item in items:
+        every = max(1, (total or 0) // _MAX_COUNTED)
+        number = 0
+        for number, item in enumerate(items, 1):
             yield item
-            counter.advance()
+            if number % every == 0:
+                counter.advance(every)
+        if number % every:
+            counter.advance(number % every)

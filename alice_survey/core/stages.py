@@ -22,8 +22,11 @@ from alice_survey.core.executor import Executor
 
 Summary = tuple[str, dict[str, Any]]
 """Result of a stage: a line of text, and JSON values."""
-StageWork = Callable[..., None]
-"""Takes the workspace, the folder to write into and where tasks run; the settings by keyword."""
+StageWork = Callable[..., Callable[[], object] | None]
+"""Takes the workspace, the folder to write into and where tasks run; the settings by keyword.
+
+It returns what draws and writes the rest, where the result is known before.
+"""
 WHOLE = "survey"
 """Names all settings at once in `StageSpec.takes`."""
 
@@ -79,8 +82,20 @@ class StageSpec:
             command=self.command,
         )
 
-    def make(self, workspace: Path, config: Config, executor: Executor) -> bool:
+    def make(
+        self,
+        workspace: Path,
+        config: Config,
+        executor: Executor,
+        say: Callable[[Path], object] = lambda folder: None,
+    ) -> bool:
         """Run the stage unless it is up to date.
+
+        Args:
+            workspace: folder of the survey.
+            config: its settings.
+            executor: where tasks run.
+            say: takes the unfinished folder once it holds the result, before the rest is written.
 
         Returns:
             True when done, False when nothing had changed.
@@ -94,7 +109,9 @@ class StageSpec:
         def work(folder: Path) -> None:
             do: StageWork = getattr(import_module(module), function)
             with executor.start() as started:
-                do(workspace, folder, started, **taken)
+                if write_rest := do(workspace, folder, started, **taken):
+                    say(folder)
+                    write_rest()
 
         return run_stage(workspace, self.stage(workspace, config), work)
 

@@ -43,7 +43,7 @@ from alice_survey.core.artefacts import atomic_path
 from alice_survey.core.errors import ConfigError, WorkspaceError
 from alice_survey.core.frames import Array
 from alice_survey.kit.document import EAST_NORTH, Figure
-from alice_survey.kit.map import round_length
+from alice_survey.kit.map import even_limit, round_length
 
 __all__ = [
     "BAND", "GRID", "INK", "INKS", "MARKS", "SOFT", "WIDTH_IN", "Axes", "BoundaryNorm",
@@ -274,12 +274,6 @@ def palette_colours(name: str, shares: Array) -> NDArray[np.uint8]:
 def palette_steps(name: str, count: int) -> list[str]:
     """Evenly spaced colours of a palette, #rrggbb."""
     return [to_hex(mpl.colormaps[name](i / (count - 1))) for i in range(count)]
-
-
-def even_limit(values: Array) -> float:
-    """Limit of a colour scale about zero that includes 97 % of the values; NaNs do not count."""
-    known = np.abs(values[np.isfinite(values)])
-    return max(float(np.percentile(known, 97.0)), 1e-9) if len(known) else 1.0
 
 
 def plain_name(name: str) -> str:

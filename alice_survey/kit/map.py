@@ -6,7 +6,16 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
+from alice_survey.core.frames import Array
 from alice_survey.kit.document import PictureLayer, ShapeLayer, SurveyMap
+
+
+def even_limit(values: Array) -> float:
+    """Limit of a colour scale about zero that includes 97 % of the values; NaNs do not count."""
+    known = np.abs(values[np.isfinite(values)])
+    return max(float(np.percentile(known, 97.0)), 1e-9) if len(known) else 1.0
 
 
 def map_data(survey_map: SurveyMap) -> tuple[str, list[tuple[str, str]]]:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import RigidTransform
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from alice_survey.core.errors import CalibrationError, warn
 from alice_survey.core.frames import Array
@@ -179,7 +179,7 @@ def halves_agreement(halves: tuple[Calibration, Calibration]) -> HalvesAgreement
     known = values > _MIN_KNOWN * values[-1]
     along = vectors[:, known].T @ (scale * apart)
     total, count = float((along**2 / values[known]).sum()), int(known.sum())
-    return HalvesAgreement(chi2=total, parameters=count, p_value=float(chi2.sf(total, count)))
+    return HalvesAgreement(chi2=total, parameters=count, p_value=float(chdtrc(count, total)))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

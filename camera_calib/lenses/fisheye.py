@@ -37,7 +37,6 @@ class FisheyeLens(LensValues):
     """
 
     model: ClassVar[str] = "fisheye"
-    kind: ClassVar[int] = 1
     falloff: ClassVar[float] = 1.0
     parameters: ClassVar[tuple[str, ...]] = (*FOCAL_AND_CENTRE, *COEFFICIENTS)
 

@@ -16,8 +16,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from alice_survey.core.compiled import BLOCK as _BLOCK
-from alice_survey.core.compiled import compiled, compiled_ieee
+from alice_survey.core.compiled import compiled_ieee
 from alice_survey.core.frames import Array
 from camera_calib.lenses.values import FOCAL_AND_CENTRE, LensValues
 
@@ -29,6 +28,7 @@ _BISECTIONS = 60
 _SETTLED = 1e-9
 """After a step of Newton's method this short in a tangent, the remaining error is its square."""
 _COUNT = 4 + len(COEFFICIENTS)
+_Terms = tuple[float, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +43,6 @@ class OpenCVLens(LensValues):
     """
 
     model: ClassVar[str] = "opencv"
-    kind: ClassVar[int] = 0
     parameters: ClassVar[tuple[str, ...]] = (*FOCAL_AND_CENTRE, *COEFFICIENTS)
 
     k1: float = 0.0
@@ -94,7 +93,14 @@ def _first_positive_root(polynomial: np.polynomial.Polynomial) -> float:
 
 
 @compiled_ieee
-def radial(r2: float, k: Array) -> tuple[float, float, float]:
+def _terms(lens: Array) -> _Terms:
+    """Coefficients as a tuple, which unlike an array no store to another can change."""
+    k = lens[4:_COUNT]
+    return k[0], k[1], k[2], k[3], k[4], k[5], k[6], k[7], k[8], k[9], k[10], k[11]
+
+
+@compiled_ieee
+def radial(r2: float, k: _Terms) -> tuple[float, float, float]:
     """L, its derivative dL/d(r2), and its denominator."""
     top = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
     bottom = 1.0 + r2 * (k[5] + r2 * (k[6] + r2 * k[7]))
@@ -104,8 +110,10 @@ def radial(r2: float, k: Array) -> tuple[float, float, float]:
     return ratio, (top_slope - ratio * bottom_slope) / bottom, bottom
 
 
-@compiled(error_model="numpy")  # a tuple of terms does as well as an array
-def distort_slopes(u: float, v: float, k: Array) -> tuple[float, float, float, float, float, float]:
+@compiled_ieee
+def distort_slopes(
+    u: float, v: float, k: _Terms
+) -> tuple[float, float, float, float, float, float]:
     """(x, y) and their derivatives dx/du, dx/dv, dy/du, dy/dv."""
     r2 = u * u + v * v
     ratio, slope, _ = radial(r2, k)
@@ -120,7 +128,7 @@ def distort_slopes(u: float, v: float, k: Array) -> tuple[float, float, float, f
 
 
 @compiled_ieee
-def undistort(x: float, y: float, k: Array, fold2: float) -> tuple[float, float]:
+def undistort(x: float, y: float, k: _Terms, fold2: float) -> tuple[float, float]:
     """The ray (u, v) that the sensor sees at (x, y); NaN where no ray before the fold goes there.
 
     Newton's method from (x, y); if it diverges, from the radial part's inverse, which bisection
@@ -161,7 +169,7 @@ def undistort(x: float, y: float, k: Array, fold2: float) -> tuple[float, float]
 def opencv_pixels(rays: Array, lens: Array, pixels: Array) -> None:
     """Pixels (B, 2), to be filled in, of rays in air (B, 3) of any length."""
     fx, fy, cx, cy, fold2 = lens[0], lens[1], lens[2], lens[3], lens[_COUNT]
-    k = lens[4:_COUNT]
+    k = _terms(lens)
     for j in range(len(rays)):
         pixels[j, 0] = pixels[j, 1] = math.nan
         dz = rays[j, 2]
@@ -180,22 +188,20 @@ def opencv_pixels(rays: Array, lens: Array, pixels: Array) -> None:
 
 @compiled_ieee
 def opencv_rays(pixels: Array, lens: Array, rays: Array) -> None:
-    """Unit rays in air (B, 3), to be filled in, that pixels (B, 2) see; at most 128 at a time.
+    """Unit rays in air (B, 3), to be filled in, that pixels (B, 2) see.
 
     Newton's method takes four steps without a branch, so that they become vector instructions;
     where the last one was not tiny yet, `undistort` takes over.
     """
-    count, fold2 = len(pixels), lens[_COUNT]
-    k = lens[4:_COUNT]
-    terms = k[0], k[1], k[2], k[3], k[4], k[5], k[6], k[7], k[8], k[9], k[10], k[11]
-    x, y, u, v = np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK)
+    count, fold2, k = len(pixels), lens[_COUNT], _terms(lens)
+    x, y, u, v = np.empty(count), np.empty(count), np.empty(count), np.empty(count)
     for j in range(count):
         x[j] = (pixels[j, 0] - lens[2]) / lens[0]
         y[j] = (pixels[j, 1] - lens[3]) / lens[1]
     for j in range(count):
         a, b, minimum, last = x[j], y[j], 1.0, 0.0
         for _ in range(4):
-            found_x, found_y, x_u, x_v, y_u, y_v = distort_slopes(a, b, terms)
+            found_x, found_y, x_u, x_v, y_u, y_v = distort_slopes(a, b, k)
             determinant = x_u * y_v - x_v * y_u
             minimum = min(minimum, determinant)
             miss_x, miss_y = found_x - x[j], found_y - y[j]
@@ -225,7 +231,7 @@ def opencv_slopes(rays: Array, lens: Array, pixels: Array, by_ray: Array, by_len
         by_ray: (B, 2, 3).
         by_lens: (B, 2, 16).
     """
-    fold2, k = lens[_COUNT], lens[4:_COUNT]
+    fold2, k = lens[_COUNT], _terms(lens)
     for j in range(len(rays)):
         dz = rays[j, 2]
         u, v = rays[j, 0] / dz, rays[j, 1] / dz

@@ -22,8 +22,6 @@ class OpticalPart:
 
     __pydantic_config__ = ConfigDict(extra="forbid", strict=True)
 
-    kind: ClassVar[int]
-    """Its number in kernels."""
     parameters: ClassVar[tuple[str, ...]]
     """Names of its parameters, ordered as its slopes."""
 

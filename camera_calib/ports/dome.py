@@ -13,7 +13,6 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from alice_survey.core.compiled import BLOCK as _BLOCK
 from alice_survey.core.compiled import compiled_ieee
 from alice_survey.core.config import CameraConfig
 from alice_survey.core.errors import CalibrationError
@@ -39,7 +38,6 @@ class DomePort(PortValues):
     """
 
     shape: ClassVar[str] = "dome"
-    kind: ClassVar[int] = 2
     parameters: ClassVar[tuple[str, ...]] = (
         *_CENTRE, "outer_radius_m", "glass_thickness_m", "n_glass", "n_water"
     )  # fmt: skip
@@ -211,7 +209,7 @@ def _sine(along: float, aside: float, reach: float, port: Array) -> float:
 
 @compiled_ieee
 def dome_rays(points: Array, port: Array, rays: Array, leans: Array) -> None:
-    """Rays in air of points in water (B, 3), at most 128 at a time.
+    """Rays in air of points in water (B, 3).
 
     Args:
         points: (B, 3).
@@ -221,8 +219,8 @@ def dome_rays(points: Array, port: Array, rays: Array, leans: Array) -> None:
     """
     count = len(points)
     cx, cy, cz, outer = port[0], port[1], port[2], port[3]
-    reach, along, aside = np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK)
-    sin, last = np.empty(_BLOCK), np.empty(_BLOCK)
+    reach, along, aside = np.empty(count), np.empty(count), np.empty(count)
+    sin, last = np.empty(count), np.empty(count)
     off2 = cx * cx + cy * cy + cz * cz
     for j in range(count):
         x, y, z = points[j, 0] - cx, points[j, 1] - cy, points[j, 2] - cz

@@ -13,7 +13,6 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from alice_survey.core.compiled import BLOCK as _BLOCK
 from alice_survey.core.compiled import compiled_ieee
 from alice_survey.core.config import CameraConfig
 from alice_survey.core.errors import CalibrationError
@@ -41,7 +40,6 @@ class FlatPort(PortValues):
     """
 
     shape: ClassVar[str] = "flat"
-    kind: ClassVar[int] = 1
     parameters: ClassVar[tuple[str, ...]] = (
         "port_distance_m", "glass_thickness_m", "n_glass", "n_water", *_NORMAL
     )  # fmt: skip
@@ -240,7 +238,7 @@ def _air_tangents(radius: Array, water: Array, port: Array, tangent: Array, step
 
 @compiled_ieee
 def flat_rays(points: Array, port: Array, rays: Array, turns: Array) -> None:
-    """Rays in air of points in water (B, 3), at most 128 at a time.
+    """Rays in air of points in water (B, 3).
 
     Args:
         points: (B, 3).
@@ -250,14 +248,14 @@ def flat_rays(points: Array, port: Array, rays: Array, turns: Array) -> None:
     """
     count = len(points)
     before, nx, ny, nz = port[0] + port[1], port[4], port[5], port[6]
-    radius, water = np.empty(_BLOCK), np.empty(_BLOCK)
-    tangent, step = np.empty(_BLOCK), np.empty(_BLOCK)
+    radius, water = np.empty(count), np.empty(count)
+    tangent, step = np.empty(count), np.empty(count)
     for j in range(count):
         x, y, z = points[j, 0], points[j, 1], points[j, 2]
         along = nx * x + ny * y + nz * z
         rx, ry, rz = x - along * nx, y - along * ny, z - along * nz
         radius[j], water[j] = math.sqrt(rx * rx + ry * ry + rz * rz), along - before
-    _air_tangents(radius[:count], water[:count], port, tangent, step)
+    _air_tangents(radius, water, port, tangent, step)
     for j in range(count):
         rays[j, 0] = rays[j, 1] = rays[j, 2] = math.nan
         if not water[j] > 0.0:

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
-from alice_survey.core.compiled import compiled_ieee
 from alice_survey.core.frames import Array
 from camera_calib.ports.values import PortValues
 
@@ -13,24 +12,25 @@ class NoPort(PortValues):
     """Nothing between the lens and what it looks at; light goes straight to the pupil."""
 
     shape: ClassVar[str] = "none"
-    kind: ClassVar[int] = 0
     parameters: ClassVar[tuple[str, ...]] = ()
 
 
 NO_PORT = NoPort()
 
 
-@compiled_ieee
-def bare_rays(points: Array, rays: Array) -> None:
+def bare_rays(points: Array, port: Array, rays: Array, turns: Array) -> None:
     """Rays in air (B, 3), to be filled in, of points (B, 3)."""
-    for j in range(len(points)):
-        rays[j, 0], rays[j, 1], rays[j, 2] = points[j, 0], points[j, 1], points[j, 2]
+    rays[:] = points
 
 
-@compiled_ieee
-def bare_leave(rays: Array, points: Array, directions: Array) -> None:
+def bare_leave(rays: Array, port: Array, points: Array, directions: Array) -> None:
     """Start (B, 3) and direction (B, 3), to be filled in, of unit rays (B, 3): both as they are."""
-    for j in range(len(rays)):
-        for axis in range(3):
-            points[j, axis] = rays[j, axis] * 0.0
-            directions[j, axis] = rays[j, axis]
+    points[:] = rays * 0.0
+    directions[:] = rays
+
+
+def bare_slopes(
+    points: Array, turns: Array, port: Array, by_ray: Array, by_point: Array, by_port: Array
+) -> None:
+    """Slopes of pixels by the point, (B, 2, 3) to be filled in: those by the ray."""
+    by_point[:] = by_ray

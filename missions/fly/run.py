@@ -5,9 +5,11 @@ Pictures show how near the plan a flight came, and what the vehicle did for it.
 
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -19,23 +21,12 @@ from alice_survey.core.executor import Executor
 from alice_survey.core.frames import Array, rotation_from_attitude
 from alice_survey.core.records import FlightRecord
 from alice_survey.core.trajectory import write_track
-from alice_survey.kit.figure import (
-    BAND,
-    INKS,
-    SOFT,
-    Axes,
-    LineCollection,
-    figure_style,
-    new_figure,
-    save_figure,
-)
 from alice_survey.sim.vehicle import estimate_vector as vector
 from alice_survey.sim.vehicle.log import VehicleLog, write_vehicle_log
 from alice_survey.sim.vehicle.navigation import tick as navigation
 from alice_survey.sim.vehicle.pilot.memory import FOLLOW, PHASE
 from alice_survey.sim.vehicle.simulator import Flown
 from camera_calib.rig import Rig, design_rig
-from missions.coverage.drawing import draw_polygons
 from missions.coverage.stations import stations_of_flight
 from missions.fly.simulation import (
     FlightSettings,
@@ -50,10 +41,13 @@ from missions.fly.simulation import (
     true_floor,
     whole_route,
 )
-from missions.logs.ros_builder import BagRecord, write_bag
 from missions.values.flight import Flight, rms
 from missions.values.navigation import write_navigation
-from missions.values.plan_file import read_plan
+from missions.values.plan_file import Plan, read_plan
+
+if TYPE_CHECKING:
+    from alice_survey.kit.figure import Axes
+    from missions.logs.ros_builder import BagRecord
 
 MAX_HEADING_DEG = 10.0
 """A picture of 4 by 3 turned by so much covers a strip narrower by a tenth."""
@@ -62,8 +56,8 @@ TRIGGER_COLUMNS = ("station", "time_s", "line")
 
 def run_fly(
     workspace: Path, folder: Path, executor: Executor, *, water: WaterConfig, **values: Any
-) -> None:
-    """Write triggers, navigation, vehicle logs, a bag, the truth and plots.
+) -> Callable[[], None]:
+    """Write the figures of a flight.
 
     Args:
         workspace: that holds the plan.
@@ -71,6 +65,9 @@ def run_fly(
         executor: not used: a flight is one task.
         water: of the survey.
         values: of `FlightSettings`.
+
+    Returns:
+        What writes triggers, navigation, vehicle logs, a bag, the truth and plots.
 
     Raises:
         VehicleError: the vehicle took no picture at all; the message says why.
@@ -81,6 +78,18 @@ def run_fly(
     fly = simulate_plan if vehicle.mission_file is None else simulate_mission
     flight = fly(plan, settings, true_floor(plan, settings), flight_noise(settings.seed))
     _check_pictures(flight, "swell" if settings.sea.swell_m > 0.0 else "current")
+    rig = design_rig(settings.camera, water)
+    summary = flight_summary(flight, vehicle, rig)
+    if vehicle.mission_file is not None:
+        summary["mission"] = mission_summary(mission_of_settings(plan, settings), flight, rig)
+    FlightRecord.save(folder / "flight.json", summary)
+    return partial(write_flight, folder, flight, plan)
+
+
+def write_flight(folder: Path, flight: Flight, plan: Plan) -> None:
+    """Write triggers, navigation, vehicle logs, a bag, the truth and plots of a flight."""
+    from missions.logs.ros_builder import write_bag
+
     write_track(folder / "truth" / "track.csv", flight.truth)
     write_vehicle_log(folder / "truth" / "vehicle.csv", true_log(flight))
     rows = zip(flight.trigger_s.tolist(), flight.trigger_line, strict=True)
@@ -92,11 +101,6 @@ def run_fly(
     write_navigation(folder / "navigation.csv", flight.log, plan.datum)
     write_vehicle_log(folder / "vehicle.csv", believed_log(flight))
     write_bag(folder / "bag", bag_record(flight))
-    rig = design_rig(settings.camera, water)
-    summary = flight_summary(flight, vehicle, rig)
-    if vehicle.mission_file is not None:
-        summary["mission"] = mission_summary(mission_of_settings(plan, settings), flight, rig)
-    FlightRecord.save(folder / "flight.json", summary)
     draw_flight(folder / "track.png", flight)
 
 
@@ -141,18 +145,25 @@ def _check_pictures(flight: Flight, sea: str) -> None:
         )
 
 
-TRUE, NAV = INKS[:2]
 _MAX_POINTS = 20_000
 _SIGMAS = 2.0
 """The band of the navigation error: 95 % of the time within it."""
 
 
-@figure_style()
 def draw_flight(path: Path, flight: Flight) -> None:
     """Draw a map of plan, true track and navigation next to strips of errors, rpm and power.
 
     The strips share their time, with the lines shaded.
     """
+    from alice_survey.kit.figure import figure_style, save_figure
+
+    with figure_style():
+        save_figure(_flight_figure(flight), path, dpi=110)
+
+
+def _flight_figure(flight: Flight) -> Any:
+    from alice_survey.kit.figure import BAND, INKS, SOFT, new_figure
+
     cross, heading = flight.line_errors
     attitude = np.rad2deg(flight.attitude_rad)
     error = (flight.log.position_ned - flight.truth.ned_from_body.translation).T
@@ -189,7 +200,7 @@ def draw_flight(path: Path, flight: Flight) -> None:
     for axes, name in zip(strips[4:6], ("north", "east"), strict=True):
         band = _SIGMAS * _column(flight.flown, f"sigma_{name}_m")[some]
         axes.fill_between(
-            time_s[some], -band, band, color=NAV, alpha=0.18, lw=0,
+            time_s[some], -band, band, color=INKS[1], alpha=0.18, lw=0,
             label=f"±{_SIGMAS:g} logged sigmas",
         )  # fmt: skip
     strips[0].set_title(f"{rms(cross):.3f} m rms on lines, heading {np.rad2deg(rms(heading)):.1f}°")
@@ -197,11 +208,14 @@ def draw_flight(path: Path, flight: Flight) -> None:
         axes.legend(loc="upper right", ncol=5, fontsize=7.5)
         axes.tick_params(labelbottom=axes is strips[-1])
     strips[-1].set_xlabel("time, s (lines shaded, survey between dashes)")
-    save_figure(figure, path, dpi=110)
+    return figure
 
 
-def _draw_map(axes: Axes, flight: Flight, some: slice) -> None:
+def _draw_map(axes: "Axes", flight: Flight, some: slice) -> None:
     """Draw plan, area and both tracks."""
+    from alice_survey.kit.figure import INKS, SOFT, LineCollection
+    from missions.coverage.drawing import draw_polygons
+
     plan = flight.plan
     axes.set_aspect("equal")
     ends = [(line.start_ne_m[::-1], line.end_ne_m[::-1]) for line in plan.lines]
@@ -213,8 +227,8 @@ def _draw_map(axes: Axes, flight: Flight, some: slice) -> None:
     draw_polygons(axes, plan.area.no_go, "no-go zone", edgecolor=INKS[3], hatch="xxx", alpha=0.5)
     for track, colour, width, label in (
         (planned, SOFT, 0.8, "planned route"),
-        (flight.glass_ned[some], TRUE, 1.0, "true track of the left port"),
-        (flight.believed_glass_ned[some], NAV, 1.0, "believed track"),
+        (flight.glass_ned[some], INKS[0], 1.0, "true track of the left port"),
+        (flight.believed_glass_ned[some], INKS[1], 1.0, "believed track"),
     ):
         axes.plot(track[:, 1], track[:, 0], color=colour, lw=width, label=label)
     north, east = (
@@ -273,8 +287,10 @@ def _log(flight: Flight, source: str, position: Array, turn: Array, velocity: Ar
     )
 
 
-def bag_record(flight: Flight) -> BagRecord:
+def bag_record(flight: Flight) -> "BagRecord":
     """All that a bag holds of a flight, at half the rate of the simulation."""
+    from missions.logs.ros_builder import BagRecord
+
     flown, log = flight.flown, flight.log
     ranges = np.column_stack([_column(flown, name) for name in _RANGES])
     heard = np.concatenate([[True], np.any(np.diff(ranges, axis=0) != 0, axis=1)])

@@ -24,7 +24,7 @@ from shapely.geometry import MultiPolygon
 
 from alice_survey.core.compiled import compiled
 from alice_survey.core.frames import Array
-from missions.lines.rows import Site, rooms, stretches, to_uv, unite
+from missions.lines.rows import Places, Site, rooms, sort_pairs, to_uv, unite
 from missions.route.ways import edges_of
 from missions.values.area import Area
 from missions.values.line import Line
@@ -163,12 +163,13 @@ def _offer(
             [_turn(places, course), (patches[:, LENGTH] * patches[:, WIDTH])[:, None]], axis=1
         )
         reach = _patch_reach(patches, heading_rad - course)
+        offsets = _try_offsets(local[:, 1], pattern.half_across_m - float(reach[1]))
         score, offset, begin, end, steps = _best_line(
             np.ascontiguousarray(local[np.argsort(local[:, 0])]),
             float(reach[0]),
             float(reach[1]),
-            _try_offsets(local[:, 1], pattern.half_across_m - float(reach[1])),
-            to_uv(allowed, course),
+            offsets,
+            *rooms(to_uv(allowed, course), offsets),
             pattern.half_across_m,
             pattern.half_along_m,
             pattern.overhang_m,
@@ -272,7 +273,9 @@ def _best_line(
     reach_along: float,
     reach_across: float,
     offsets: Array,
-    allowed: Array,
+    begins: Places,
+    counts: Places,
+    found: Array,
     half_across: float,
     half_along: float,
     overhang: float,
@@ -286,7 +289,9 @@ def _best_line(
         reach_along: half the size of what a point stands for, along.
         reach_across: the same across.
         offsets: (O,) ascending, to try.
-        allowed: (A, 4) u, v of the edges of the allowed area.
+        begins: of the `rooms` of the offsets.
+        counts: of the same.
+        found: of the same.
         half_across: what a line sees.
         half_along: what a picture sees.
         overhang: of a line over what it must see.
@@ -296,7 +301,6 @@ def _best_line(
     Returns:
         Worth per metre (0: no line sees anything), offset, begin, end, steps.
     """
-    begins, counts, found = rooms(allowed, offsets)
     hop = _HOP_STEPS * step
     best, best_v, best_begin, best_end, best_steps = 0.0, 0.0, 0.0, 0.0, 0
     for i in range(offsets.size):
@@ -358,8 +362,6 @@ def unseen(
     """
     if len(cuts) == 0:
         return np.empty((0, 6))
-    firsts = np.searchsorted(pieces[:, 0], np.arange(len(offsets) + 1))
-    cut_firsts = np.searchsorted(cuts[:, 0], np.arange(len(offsets) + 1))
     rows = np.unique(cuts[:, 0]).astype(np.intp)
     low, high = offsets[rows] - pattern.half_across_m, offsets[rows] + pattern.half_across_m
     sides = np.concatenate(
@@ -371,48 +373,38 @@ def unseen(
         ]
     )
     # Places between the outer sides of two cut rows' swaths that neither sees have no patches.
-    levels, widths = _strips(np.unique(sides), low, high, finest_m)
-    patches: Array = _patches(
-        survey,
-        levels,
-        widths,
-        offsets,
-        firsts,
-        pieces,
-        cut_firsts,
-        cuts,
-        pattern.half_across_m,
-        pattern.half_along_m,
-        pattern.passes,
-        pattern.passes * pattern.pictures,
-        finest_m,
-    )
-    return patches
+    strips = _strips(np.unique(sides), low, high, finest_m)
+    seen = pattern.half_across_m, pattern.half_along_m
+    least = pattern.passes, pattern.passes * pattern.pictures
+    return _seek(survey, strips, offsets, pieces, cuts, seen, least, finest_m)
 
 
 def all_patches(survey: Array, finest_m: float) -> Array:
     """An area as patches that nothing has seen yet; arguments and result as of `unseen`."""
-    levels, widths = _strips(
-        np.unique(survey[:, 1]),
-        survey[:, 1].min(keepdims=True),
-        survey[:, 1].max(keepdims=True),
-        finest_m,
-    )
+    v, cuts = np.unique(survey[:, 1]), np.array([[0.0, -np.inf, np.inf]])
+    strips, none = _strips(v, v[:1], v[-1:], finest_m), np.empty((0, 4))
+    return _seek(survey, strips, np.zeros(1), none, cuts, (np.inf, 0.0), (1, 1), finest_m)
+
+
+def _seek(
+    survey: Array,
+    strips: tuple[Array, Array],
+    offsets: Array,
+    pieces: Array,
+    cuts: Array,
+    seen: tuple[float, float],
+    least: tuple[int, int],
+    finest_m: float,
+) -> Array:
+    """Patches of `unseen` in strips; what pictures see across and along; lines and pictures."""
+    levels, widths = strips
+    near = np.searchsorted(offsets, np.stack([levels - seen[0], levels + seen[0]]))
+    rows = np.arange(len(offsets) + 1)
     patches: Array = _patches(
-        survey,
-        levels,
-        widths,
-        np.zeros(1),
-        np.zeros(2, np.int64),
-        np.empty((0, 4)),
-        np.array([0, 1]),
-        np.array([[0.0, -np.inf, np.inf]]),
-        np.inf,
-        0.0,
-        1,
-        1,
-        finest_m,
-    )
+        *rooms(survey, levels, 0.0), levels, widths,
+        np.searchsorted(pieces[:, 0], rows)[near], pieces,
+        np.searchsorted(cuts[:, 0], rows)[near], cuts, seen[1], *least, finest_m,
+    )  # fmt: skip
     return patches
 
 
@@ -459,40 +451,33 @@ def pictures_of(begin: float, end: float, steps: float, u: float, half_along: fl
 
 @compiled
 def _patches(
-    survey: Array,
+    begins: Places,
+    counts: Places,
+    inside: Array,
     levels: Array,
     widths: Array,
-    offsets: Array,
-    firsts: NDArray[np.int64],
+    near: Places,
     pieces: Array,
-    cut_firsts: NDArray[np.int64],
+    near_cuts: Places,
     cuts: Array,
-    half_across: float,
     half_along: float,
     passes: int,
     pictures: int,
     finest: float,
 ) -> Array:
     """Patches of `unseen`, level by level; see there."""
-    starts, inside = stretches(survey, levels)
     found = np.empty((256, 6))
     used = 0
     marks = np.empty((64, 2))
     for i in range(levels.size):
-        v = levels[i]
-        if half_across == np.inf:
-            row_0, row_1 = 0, offsets.size
-        else:
-            row_0 = np.searchsorted(offsets, v - half_across)
-            row_1 = np.searchsorted(offsets, v + half_across)
-        count = cut_firsts[row_1] - cut_firsts[row_0]
+        count = near_cuts[1, i] - near_cuts[0, i]
         windows = np.empty((count, 2))
         for k in range(count):
-            windows[k, 0] = cuts[cut_firsts[row_0] + k, 1] - half_along
-            windows[k, 1] = cuts[cut_firsts[row_0] + k, 2] + half_along
+            windows[k, 0] = cuts[near_cuts[0, i] + k, 1] - half_along
+            windows[k, 1] = cuts[near_cuts[0, i] + k, 2] + half_along
         count = unite(windows, 0, count)
         k = 0
-        for j in range(starts[i], starts[i + 1]):
+        for j in range(begins[i], begins[i] + counts[i]):
             while k < count and windows[k, 1] <= inside[j, 0]:
                 k += 1
             w = k
@@ -503,7 +488,7 @@ def _patches(
                 # What is seen changes where a picture begins or ends.
                 size = 2
                 marks[0, 0], marks[1, 0] = low, high
-                for p in range(firsts[row_0], firsts[row_1]):
+                for p in range(near[0, i], near[1, i]):
                     begin, end, steps = pieces[p, 1], pieces[p, 2], pieces[p, 3]
                     if end + half_along < low or begin - half_along > high:
                         continue
@@ -520,14 +505,14 @@ def _patches(
                                     marks = np.concatenate((marks, np.empty_like(marks)))
                                 marks[size, 0] = mark
                                 size += 1
-                ordered = np.sort(marks[:size, 0])
+                sort_pairs(marks, 0, size)
                 for m in range(size - 1):
-                    length = ordered[m + 1] - ordered[m]
+                    length = marks[m + 1, 0] - marks[m, 0]
                     if length <= _TINY_M:
                         continue
-                    u = (ordered[m] + ordered[m + 1]) / 2
+                    u = (marks[m, 0] + marks[m + 1, 0]) / 2
                     lines, total = 0, 0
-                    for p in range(firsts[row_0], firsts[row_1]):
+                    for p in range(near[0, i], near[1, i]):
                         seen = pictures_of(pieces[p, 1], pieces[p, 2], pieces[p, 3], u, half_along)
                         lines += 1 if seen > 0 else 0
                         total += seen
@@ -537,8 +522,8 @@ def _patches(
                     for part in range(parts):
                         if used == found.shape[0]:
                             found = np.concatenate((found, np.empty_like(found)))
-                        found[used, U] = ordered[m] + (part + 0.5) * length / parts
-                        found[used, V] = v
+                        found[used, U] = marks[m, 0] + (part + 0.5) * length / parts
+                        found[used, V] = levels[i]
                         found[used, LENGTH] = length / parts
                         found[used, WIDTH] = widths[i]
                         found[used, LINES] = lines

@@ -140,7 +140,7 @@ def order_lines(
 
 def note_planner() -> None:
     """Report that the first plan after an installation waits until the planner is compiled."""
-    note_compiling(rows.lay_rows, "the planner, once: this takes 40 s to a minute")
+    note_compiling(rows.lay_pieces, "the planner, once: this takes some 20 s")
 
 
 def check_size(area: Area, pattern: Pattern, max_stations: int = MAX_STATIONS) -> None:

@@ -27,6 +27,7 @@ count; and a line may run this close outside of the allowed area, so that it may
 _MIN_M = 1e-3
 """Shortest room along a line: where the vehicle has less, no line is flown."""
 _EVEN = 1e-9
+Places = NDArray[np.int64]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -48,7 +49,6 @@ class Site:
         )
 
 
-@compiled
 def to_uv(edges_ne: Array, heading_rad: float) -> Array:
     """Turn edges into the frame of the lines.
 
@@ -60,15 +60,12 @@ def to_uv(edges_ne: Array, heading_rad: float) -> Array:
         (E, 4) u and v of both ends.
     """
     c, s = math.cos(heading_rad), math.sin(heading_rad)
-    uv = np.empty_like(edges_ne)
-    for e in range(edges_ne.shape[0]):
-        for k in (0, 2):
-            uv[e, k] = c * edges_ne[e, k] + s * edges_ne[e, k + 1]
-            uv[e, k + 1] = c * edges_ne[e, k + 1] - s * edges_ne[e, k]
+    north, east = edges_ne[:, ::2], edges_ne[:, 1::2]
+    uv = np.empty((len(edges_ne), 4))
+    uv[:, ::2], uv[:, 1::2] = c * north + s * east, c * east - s * north
     return uv
 
 
-@compiled
 def row_offsets(low_m: float, high_m: float, spacing_m: float, edge_m: float, passes: int) -> Array:
     """Offsets of the rows: the fewest of constant spacing, centred, that reach over both sides.
 
@@ -81,7 +78,8 @@ def row_offsets(low_m: float, high_m: float, spacing_m: float, edge_m: float, pa
     """
     steps = max(math.ceil((high_m - low_m + 2 * edge_m) / spacing_m - _EVEN), passes - 1, 0)
     places = np.arange(steps + 1, dtype=np.float64) - steps / 2
-    return (low_m + high_m) / 2 + spacing_m * places
+    offsets: Array = (low_m + high_m) / 2 + spacing_m * places
+    return offsets
 
 
 @compiled
@@ -121,137 +119,123 @@ def unite(pairs: Array, first: int, last: int) -> int:
 
 
 @compiled
-def stretches(edges: Array, levels: Array) -> tuple[NDArray[np.int64], Array]:
-    """The stretches of level lines that lie in an area, by even and odd crossings.
-
-    Args:
-        edges: (E, 4) u, v of both ends of every edge of closed rings.
-        levels: (L,) ascending v.
-
-    Returns:
-        (L + 1,) where each level's stretches begin, and (N, 2) their begin and end, ascending.
-    """
-    count = levels.size
-    starts = np.zeros(count + 1, np.int64)
-    for e in range(edges.shape[0]):
-        low, high = min(edges[e, 1], edges[e, 3]), max(edges[e, 1], edges[e, 3])
-        for i in range(np.searchsorted(levels, low), np.searchsorted(levels, high)):
-            starts[i + 1] += 1
-    for i in range(count):
-        starts[i + 1] += starts[i]
-    crossings = np.empty((starts[count], 2))
-    filled = starts[:-1].copy()
-    for e in range(edges.shape[0]):
+def _strip_intervals(
+    edges: Array, sides: Array, with_edges: bool, overhang_m: float
+) -> tuple[Places, Places, Array]:
+    """As `reaches`, of strips whose sides are levels (2, R), with or without what is between."""
+    count, rows = edges.shape[0], sides.shape[1]
+    # Of each row three parts: where edges cross its left side, its right side, and lie between.
+    met = np.empty((count, 2, 2), np.int64)
+    starts = np.zeros(3 * rows + 1, np.int64)
+    for e in range(count):
+        for side in range(2):
+            for end in range(2):
+                low, high = 0, rows
+                while low < high:
+                    middle = (low + high) // 2
+                    if sides[side, middle] < edges[e, 1 + 2 * end]:
+                        low = middle + 1
+                    else:
+                        high = middle
+                met[e, side, end] = low
+            low, high = met[e, side, 0], met[e, side, 1]
+            met[e, side, 0], met[e, side, 1] = min(low, high), max(low, high)
+            for i in range(met[e, side, 0], met[e, side, 1]):
+                starts[3 * i + side + 1] += 1
+        if with_edges:
+            for i in range(met[e, 1, 0], met[e, 0, 1]):
+                starts[3 * i + 3] += 1
+    for k in range(3 * rows):
+        starts[k + 1] += starts[k]
+    pairs, filled = np.empty((starts[3 * rows], 2)), starts.copy()
+    for e in range(count):
         u0, v0, u1, v1 = edges[e, 0], edges[e, 1], edges[e, 2], edges[e, 3]
-        for i in range(np.searchsorted(levels, min(v0, v1)), np.searchsorted(levels, max(v0, v1))):
-            share = (levels[i] - v0) / (v1 - v0)
-            crossings[filled[i], 0] = u0 + share * (u1 - u0)
-            crossings[filled[i], 1] = 0.0
-            filled[i] += 1
-    found = np.empty((starts[count] // 2, 2))
-    for i in range(count):
-        sort_pairs(crossings, starts[i], starts[i + 1])
-        for k in range(starts[i], starts[i + 1] - 1, 2):
-            found[k // 2, 0] = crossings[k, 0]
-            found[k // 2, 1] = crossings[k + 1, 0]
-    for i in range(count + 1):
-        starts[i] //= 2
-    return starts, found
+        for side in range(2):
+            for i in range(met[e, side, 0], met[e, side, 1]):
+                share = (sides[side, i] - v0) / (v1 - v0)
+                pairs[filled[3 * i + side], 0] = u0 + share * (u1 - u0)
+                pairs[filled[3 * i + side], 1] = 0.0
+                filled[3 * i + side] += 1
+        if not with_edges:
+            continue
+        for i in range(met[e, 1, 0], met[e, 0, 1]):
+            a, b = u0, u1
+            if v1 != v0:
+                at_left = u0 + (sides[0, i] - v0) / (v1 - v0) * (u1 - u0)
+                at_right = u0 + (sides[1, i] - v0) / (v1 - v0) * (u1 - u0)
+                if v0 < sides[0, i]:
+                    a = at_left
+                elif v0 > sides[1, i]:
+                    a = at_right
+                if v1 < sides[0, i]:
+                    b = at_left
+                elif v1 > sides[1, i]:
+                    b = at_right
+            pairs[filled[3 * i + 2], 0] = min(a, b)
+            pairs[filled[3 * i + 2], 1] = max(a, b)
+            filled[3 * i + 2] += 1
+    begins, counts = np.empty(rows, np.int64), np.empty(rows, np.int64)
+    for i in range(rows):
+        first = top = begins[i] = starts[3 * i]
+        for part in range(3):
+            # The area is between one crossing and the next.
+            step = 1 if part == 2 else 2
+            if step == 2:
+                sort_pairs(pairs, starts[3 * i + part], starts[3 * i + part + 1])
+            for k in range(starts[3 * i + part], starts[3 * i + part + 1], step):
+                pairs[top, 0] = pairs[k, 0]
+                pairs[top, 1] = pairs[k, 1] if step == 1 else pairs[k + 1, 0]
+                top += 1
+        for again in range(2):
+            top = first + unite(pairs, first, top)
+            if again or overhang_m == 0.0:
+                break
+            for k in range(first, top):
+                begin, end = pairs[k, 0] - overhang_m, pairs[k, 1] + overhang_m
+                if begin > end:
+                    begin = end = (begin + end) / 2
+                pairs[k, 0], pairs[k, 1] = begin, end
+        counts[i] = top - first
+    return begins, counts, pairs
 
 
-@compiled
 def reaches(
-    edges: Array, offsets: Array, half_m: float
-) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+    edges: Array, offsets: Array, half_m: float, overhang_m: float = 0.0
+) -> tuple[Places, Places, Array]:
     """Project an area within strips on u.
 
     Args:
         edges: (E, 4) u, v of both ends of every edge of the area's rings.
         offsets: (R,) ascending middles of the strips.
         half_m: half their width.
+        overhang_m: how far the projections are made longer at both ends.
 
     Returns:
         (R,) where each strip's intervals begin, (R,) how many they are, and (N, 2) intervals, each
         strip's apart and ascending.
     """
     half = half_m - TOUCH_M
-    low, high = offsets - half, offsets + half
-    low_starts, low_found = stretches(edges, low)
-    high_starts, high_found = stretches(edges, high)
-    count = offsets.size
-    begins = np.zeros(count + 1, np.int64)
-    for i in range(count):
-        begins[i + 1] = low_starts[i + 1] - low_starts[i] + high_starts[i + 1] - high_starts[i]
-    for e in range(edges.shape[0]):
-        minimum, maximum = min(edges[e, 1], edges[e, 3]), max(edges[e, 1], edges[e, 3])
-        for i in range(np.searchsorted(high, minimum), np.searchsorted(low, maximum)):
-            begins[i + 1] += 1
-    for i in range(count):
-        begins[i + 1] += begins[i]
-    found = np.empty((begins[count], 2))
-    filled = begins[:-1].copy()
-    for i in range(count):
-        for k in range(low_starts[i], low_starts[i + 1]):
-            found[filled[i]] = low_found[k]
-            filled[i] += 1
-        for k in range(high_starts[i], high_starts[i + 1]):
-            found[filled[i]] = high_found[k]
-            filled[i] += 1
-    for e in range(edges.shape[0]):
-        u0, v0, u1, v1 = edges[e, 0], edges[e, 1], edges[e, 2], edges[e, 3]
-        minimum, maximum = min(v0, v1), max(v0, v1)
-        for i in range(np.searchsorted(high, minimum), np.searchsorted(low, maximum)):
-            a, b = u0, u1
-            if v1 != v0:
-                at_low = u0 + (low[i] - v0) / (v1 - v0) * (u1 - u0)
-                at_high = u0 + (high[i] - v0) / (v1 - v0) * (u1 - u0)
-                if v0 < low[i]:
-                    a = at_low
-                elif v0 > high[i]:
-                    a = at_high
-                if v1 < low[i]:
-                    b = at_low
-                elif v1 > high[i]:
-                    b = at_high
-            found[filled[i], 0] = min(a, b)
-            found[filled[i], 1] = max(a, b)
-            filled[i] += 1
-    counts = np.zeros(count, np.int64)
-    for i in range(count):
-        counts[i] = unite(found, begins[i], begins[i + 1])
-    return begins, counts, found
+    sides = np.stack([offsets - half, offsets + half])
+    found: tuple[Places, Places, Array] = _strip_intervals(edges, sides, True, overhang_m)
+    return found
 
 
-@compiled
-def rooms(edges: Array, offsets: Array) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+def rooms(edges: Array, offsets: Array, touch_m: float = TOUCH_M) -> tuple[Places, Places, Array]:
     """Where lines may be flown: the stretches of rows that lie in an area or follow its edge.
 
     Args:
         edges: (E, 4) u, v of both ends of every edge of the allowed area's rings.
         offsets: (R,) ascending v of the rows.
+        touch_m: how close outside of the area a row may follow its edge.
 
     Returns:
-        As `reaches`.
+        As `reaches`, by even and odd crossings of the edges.
     """
-    left_starts, left = stretches(edges, offsets - TOUCH_M)
-    right_starts, right = stretches(edges, offsets + TOUCH_M)
-    count = offsets.size
-    begins = left_starts + right_starts
-    found = np.empty((begins[count], 2))
-    counts = np.zeros(count, np.int64)
-    for i in range(count):
-        k = begins[i]
-        for j in range(left_starts[i], left_starts[i + 1]):
-            found[k] = left[j]
-            k += 1
-        for j in range(right_starts[i], right_starts[i + 1]):
-            found[k] = right[j]
-            k += 1
-        counts[i] = unite(found, begins[i], begins[i + 1])
-    return begins, counts, found
+    sides = np.stack([offsets - touch_m, offsets + touch_m])
+    found: tuple[Places, Places, Array] = _strip_intervals(edges, sides, False, 0.0)
+    return found
 
 
-@compiled
 def lay_rows(
     survey: Array,
     allowed: Array,
@@ -280,35 +264,43 @@ def lay_rows(
         (P, 4) pieces: row, begin, end, steps; by row and u. And (C, 3) stretches that should be
         flown and cannot: row, begin, end.
     """
-    reach_begins, reach_counts, reach = reaches(survey, offsets, half_m)
-    room_begins, room_counts, room = rooms(allowed, offsets)
-    count = offsets.size
-    bound = 0
-    for i in range(count):
-        bound += reach_counts[i] + room_counts[i]
-    pieces = np.empty((bound, 4))
-    cuts = np.empty((bound + count, 3))
+    reach, room = reaches(survey, offsets, half_m, overhang_m), rooms(allowed, offsets)
+    bound = int(reach[1].sum() + room[1].sum())
+    # Each piece that lies within a stretch to fly parts what is cut of it.
+    pieces, cuts = np.empty((bound, 4)), np.empty((3 * bound, 3))
+    laid, cut = lay_pieces(*reach, *room, step_m, min_steps, pieces, cuts)
+    return pieces[:laid].copy(), cuts[:cut].copy()
+
+
+@compiled
+def lay_pieces(
+    reach_begins: Places,
+    reach_counts: Places,
+    reach: Array,
+    room_begins: Places,
+    room_counts: Places,
+    room: Array,
+    step_m: float,
+    min_steps: int,
+    pieces: Array,
+    cuts: Array,
+) -> tuple[int, int]:
+    """Write the pieces and cuts of `lay_rows` within rooms; return how many they are."""
     laid, cut = 0, 0
     min_m = min_steps * step_m
-    for i in range(count):
+    for i in range(reach_counts.size):
         first_of_row = laid
-        first_wish, last_wish = reach_begins[i], reach_begins[i] + reach_counts[i]
-        for k in range(first_wish, last_wish):
-            begin, end = reach[k, 0] - overhang_m, reach[k, 1] + overhang_m
-            if begin > end:
-                begin = end = (begin + end) / 2
-            reach[k, 0], reach[k, 1] = begin, end
-        wished = unite(reach, first_wish, last_wish)
-        k = first_wish
+        first_wish = k = reach_begins[i]
+        last_wish = first_wish + reach_counts[i]
         for r in range(room_begins[i], room_begins[i] + room_counts[i]):
             room_begin, room_end = room[r, 0], room[r, 1]
             if room_end - room_begin < _MIN_M:
                 continue
             first_of_room = laid
-            while k < first_wish + wished and reach[k, 1] < room_begin:
+            while k < last_wish and reach[k, 1] < room_begin:
                 k += 1
             j = k
-            while j < first_wish + wished and reach[j, 0] <= room_end:
+            while j < last_wish and reach[j, 0] <= room_end:
                 begin, end = max(reach[j, 0], room_begin), min(reach[j, 1], room_end)
                 lack = min_m - (end - begin)
                 if lack > 0.0:
@@ -330,7 +322,7 @@ def lay_rows(
                 begin = max(room_begin, end - steps * step_m)
                 pieces[p, 1], pieces[p, 2], pieces[p, 3] = begin, end, steps
         p = first_of_row
-        for k in range(first_wish, first_wish + wished):
+        for k in range(first_wish, last_wish):
             begin = reach[k, 0]
             while p < laid and pieces[p, 2] < begin:
                 p += 1
@@ -341,12 +333,10 @@ def lay_rows(
                 if end > begin + TOUCH_M or (end == begin == reach[k, 0] == reach[k, 1]):
                     if j < laid and pieces[j, 1] <= begin:
                         break
-                    if cut == cuts.shape[0]:
-                        cuts = np.concatenate((cuts, np.empty_like(cuts)))
                     cuts[cut, 0], cuts[cut, 1], cuts[cut, 2] = i, begin, end
                     cut += 1
                 lacking = j < laid and pieces[j, 2] < reach[k, 1]
                 if lacking:
                     begin = max(begin, pieces[j, 2])
                     j += 1
-    return pieces[:laid].copy(), cuts[:cut].copy()
+    return laid, cut

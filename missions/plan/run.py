@@ -6,23 +6,19 @@ the cameras open and goes out after they close, by its lead.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.core.artefacts import EXPORTS, write_csv, write_json
-from alice_survey.core.config import SeaConfig, SurveyConfig
+from alice_survey.core.config import SurveyConfig
 from alice_survey.core.errors import PlanError
 from alice_survey.core.executor import Executor
 from alice_survey.core.run import progress
-from alice_survey.kit.figure import save_figure
-from camera_calib.rig import Rig, design_rig
-from missions.exports.format import Options, options_of
-from missions.exports.write import write_exports
-from missions.plan.map import plan_figure
-from missions.plan.planner import Planned, plan_survey
+from camera_calib.rig import design_rig
+from missions.plan.planner import plan_survey
 from missions.plan.rows import settings_table
 from missions.values.costs import Costs, leg_costs
 from missions.values.plan_file import Dive, Plan
@@ -36,43 +32,38 @@ HEADER = (
 """Columns of the time table: times since the start, then the same relative to the trigger."""
 
 
-def run_plan(workspace: Path, folder: Path, executor: Executor, *, survey: SurveyConfig) -> None:
-    """Write plan.json, its certificate, settings, maps and missions for vehicles.
+def run_plan(
+    workspace: Path, folder: Path, executor: Executor, *, survey: SurveyConfig
+) -> Callable[[], None]:
+    """Write plan.json, its certificate, settings and triggers.
+
+    Returns:
+        What writes maps and missions for vehicles.
 
     Raises:
         PlanError: no plan meets the settings.
     """
     rig = design_rig(survey.camera, survey.water)
     planned = plan_survey(survey, rig)
-    options = options_of(survey.camera, survey.plan, survey.vehicle, survey.sea)
-    write_planned(folder, planned, rig, options, survey.sea)
-
-
-@progress.step("write plan, maps and missions")
-def write_planned(
-    folder: Path,
-    planned: Planned,
-    rig: Rig,
-    options: Options,
-    sea: SeaConfig,
-) -> None:
-    """Write a plan.
-
-    Args:
-        folder: of the stage.
-        planned: the plan and what led to it.
-        rig: its cameras in water.
-        options: what vehicles need besides the plan.
-        sea: the current that maps show.
-    """
     plan = planned.plan
     write_json(folder / "plan.json", plan.to_json())
     write_json(folder / "certificate.json", planned.certificate.to_json())
     (folder / "settings.txt").write_text(settings_table(planned.rows) + "\n", encoding="utf-8")
     write_triggers(folder, plan, planned.costs, planned.imaging.shortest_interval_s)
-    figure = plan_figure(plan, rig, planned.certificate, planned.bathymetry, sea)
-    save_figure(figure, folder / "map.png")
-    write_exports(folder / EXPORTS, plan, rig, options=options)
+
+    @progress.step("write maps and missions")
+    def write_maps_and_missions() -> None:
+        from alice_survey.kit.figure import save_figure
+        from missions.exports.format import options_of
+        from missions.exports.write import write_exports
+        from missions.plan.map import plan_figure
+
+        figure = plan_figure(plan, rig, planned.certificate, planned.bathymetry, survey.sea)
+        save_figure(figure, folder / "map.png")
+        options = options_of(survey.camera, survey.plan, survey.vehicle, survey.sea)
+        write_exports(folder / EXPORTS, plan, rig, options=options)
+
+    return write_maps_and_missions
 
 
 def write_triggers(folder: Path, plan: Plan, costs: Costs, shortest_interval_s: float) -> None:

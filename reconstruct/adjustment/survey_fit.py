@@ -27,7 +27,7 @@ from typing import Self
 import numpy as np
 import pycolmap
 from scipy.spatial.transform import RigidTransform, Rotation
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from alice_survey.core.block_solver import BlockStep, Flags, inverse_of, minimise
 from alice_survey.core.config import ReconstructConfig
@@ -163,7 +163,7 @@ def contradiction(
     along = directions[:, measured].T @ (white @ change)
     total = float((along**2 / gain[measured]).sum())
     count = int(measured.sum())
-    if count == 0 or chi2.sf(total, count) > _UNLIKELY:
+    if count == 0 or chdtrc(count, total) > _UNLIKELY:
         return None
     pulls = change / sigmas
     order = np.argsort(-np.abs(pulls))

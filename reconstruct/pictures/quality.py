@@ -21,7 +21,6 @@ from alice_survey.core.block_solver import MAD_TO_SIGMA
 from alice_survey.core.errors import ImageError, why
 from alice_survey.core.executor import Executor
 from alice_survey.core.manifest import ImageRecord, read_manifest
-from alice_survey.kit.figure import INKS, figure_style, new_figure, save_figure
 from reconstruct.pictures.files import decode
 from reconstruct.pictures.normalise import even_light
 from reconstruct.pictures.undistorted import read_mask
@@ -234,9 +233,17 @@ _HEADER = ("image", "camera", "station", *_NUMBERS, "reasons")
 _STRIPS = ("sharpness", "contrast", "veil", "brightness")
 
 
-@figure_style()
 def plot_quality(path: Path, found: Sequence[PictureQuality]) -> None:
     """Draw figures of all pictures in their order, the flagged ones in circles."""
+    from alice_survey.kit.figure import figure_style, save_figure
+
+    with figure_style():
+        save_figure(_quality_figure(found), path)
+
+
+def _quality_figure(found: Sequence[PictureQuality]) -> Any:
+    from alice_survey.kit.figure import INKS, new_figure
+
     figure = new_figure(5.2, 12)
     axes = figure.subplots(len(_STRIPS), 1, sharex=True)
     cameras = sorted({quality.camera for quality in found})
@@ -259,7 +266,7 @@ def plot_quality(path: Path, found: Sequence[PictureQuality]) -> None:
     axes[0].legend(loc="lower right", ncols=len(cameras))
     axes[-1].set_xlabel("picture")
     axes[-1].xaxis.get_major_locator().set_params(integer=True)
-    save_figure(figure, path)
+    return figure
 
 
 def quality_report(workspace: Path, executor: Executor) -> tuple[str, dict[str, Any]]:

@@ -11,7 +11,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import brentq
 
 from alice_survey.core.block_solver import MAD_TO_SIGMA
 from alice_survey.core.errors import warn
@@ -385,6 +384,8 @@ def real_sigma_factor(control: ControlFit, place: Similarity, parameters: int) -
     def excess(log_factor: float) -> float:
         coarser = widen(control, float(np.exp(log_factor)))
         return 3.0 * float(np.square(coarser.misfits(place)).sum()) / freedom - 1.0
+
+    from scipy.optimize import brentq
 
     ratio = 1.0 + excess(0.0)
     if ratio <= 1.0 + _CHI_SIGMAS * np.sqrt(2.0 / freedom):

@@ -42,7 +42,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.core.artefacts import (
@@ -756,6 +755,8 @@ def _fit(
     """Misses (N, 2) px of the best point, the point (3,), and their derivatives (2 N, 3)."""
     own = own_sigmas(picks)
     usual = float(np.median(own))
+    from scipy.optimize import least_squares
+
     near_px = max(_ROBUST_PX, 2.0 * usual)
     weight = np.repeat(usual / own, 2)
     unit = float(np.linalg.norm(start - cameras[picks[0].image].model_from_pinhole.translation))

@@ -14,11 +14,7 @@ import numpy as np
 import pytest
 
 from alice_survey.core.cluster import engine
-from alice_survey.core.cluster.engine import (
-    ClusterExecutor,
-    cluster_executor,
-    read_cluster_file,
-)
+from alice_survey.core.cluster.engine import ClusterExecutor, cluster_executor, read_cluster_file
 from alice_survey.core.cluster.shared_values import LARGE_BYTES, pack, pack_once, unpack
 from alice_survey.core.cluster.worker import code_and_versions
 from alice_survey.core.errors import AliceError, ConfigError, WorkspaceError, keep_warnings

@@ -18,8 +18,7 @@ import pytest
 from alice_survey.core.errors import AliceError, keep_warnings, note, warn
 from alice_survey.core.executor import SERIAL, Executor, local_executor
 from alice_survey.core.run import progress
-from tests.alice_survey.app.studio.client import until
-from tests.engines import PicklingThreads
+from tests.engines import PicklingThreads, until
 
 WORKERS = """
 import os, sys, time

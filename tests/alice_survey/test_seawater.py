@@ -7,12 +7,7 @@ from hypothesis import strategies as st
 
 from alice_survey.core.errors import ConfigError
 from alice_survey.core.seawater import GREEN_NM, n_water, n_water_sigma, pressure_dbar
-from tests.oracles_water import (
-    fresh_density_kg_m3,
-    n_air,
-    n_fresh_iapws,
-    n_sea_millard_seaver,
-)
+from tests.oracles_water import fresh_density_kg_m3, n_air, n_fresh_iapws, n_sea_millard_seaver
 
 
 def test_anchors_of_the_levant_sea(capsys: pytest.CaptureFixture[str]) -> None:

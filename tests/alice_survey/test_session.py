@@ -22,7 +22,7 @@ from alice_survey.app.commands.base import ReportCommand, option
 from alice_survey.core.errors import PlanError, note, warn
 from alice_survey.core.executor import local_executor
 from alice_survey.core.run import interrupts, progress
-from tests.alice_survey.app.studio.client import until
+from tests.engines import until
 
 
 class Works(ReportCommand):
@@ -112,10 +112,7 @@ def test_the_end_of_a_run_is_reported(
 
 @pytest.mark.parametrize("path", ["-", "FOLDER", "FILE/below", "/dev/full"])
 def test_a_file_that_cannot_be_written_ends_the_run_before_it_begins(
-    path: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    path: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("FOLDER").mkdir()

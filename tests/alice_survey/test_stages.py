@@ -1,5 +1,6 @@
 """One list of stages: what it declares, what reads it, and workspaces of version 0.1.0."""
 
+import ast
 import json
 import subprocess
 import sys
@@ -129,18 +130,39 @@ def test_a_report_reads_what_version_0_1_0_wrote(old: Path) -> None:
     assert len(found[-1].tables[0].rows) == len(STAGES) - 1
 
 
-def test_status_loads_no_package_that_works(old: Path) -> None:
+_WORKS = {"numba", "shapely"}
+_READS = {"cv2", "pycolmap", "rasterio"}
+_DRAWS = {"matplotlib", "open3d", "pandas", "rosbags", "scipy.signal", "scipy.stats", "trimesh"}
+
+
+@pytest.mark.parametrize(
+    ("command", "heavy"),
+    [
+        (["status"], _WORKS | _READS | _DRAWS | {"scipy"}),
+        (["plan"], _READS | _DRAWS | {"scipy.optimize", "scipy.interpolate"}),
+        (["fly"], _READS | _DRAWS),
+        (["studio", "--no-browser"], _DRAWS | {"scipy.optimize"}),
+    ],
+)
+def test_a_result_is_printed_before_what_it_does_not_need_is_loaded(
+    command: list[str], heavy: set[str], old: Path
+) -> None:
     code = (
-        "import sys; from pathlib import Path\n"
-        "from alice_survey.app.pipeline import workspace_status\n"
-        "assert workspace_status(Path(sys.argv[1]), None)[1]['stages']['mesh']\n"
-        "heavy = {'scipy', 'numba', 'cv2', 'pycolmap', 'open3d', 'shapely', 'rasterio'}\n"
-        "sys.exit(', '.join(heavy & set(sys.modules)) or 0)"
+        "import os, sys, typer\n"
+        "def echo(text, err=False):\n"
+        f"    os.write(1, repr((text, {heavy} & set(sys.modules))).encode())\n"
+        "    os._exit(0)\n"
+        "typer.echo = echo\n"
+        "from alice_survey.app.cli.main import main\n"
+        "main()"
     )
+    if command == ["fly"]:
+        run(["plan"], old, None)
     done = subprocess.run(
-        [sys.executable, "-c", code, str(old)], capture_output=True, text=True, check=False
+        [sys.executable, "-c", code, *command, "-w", str(old)], capture_output=True, text=True
     )
-    assert done.returncode == 0, done.stderr
+    text, loaded = ast.literal_eval(done.stdout)
+    assert not loaded and str(old) in text, done.stderr
 
 
 def records_of(base: type[JsonRecord]) -> list[type[JsonRecord]]:

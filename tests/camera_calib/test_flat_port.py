@@ -64,10 +64,7 @@ def test_a_pixel_comes_back_within_a_billionth(camera: Camera, distance_m: float
 
 @settings(deadline=None, max_examples=60)
 @given(
-    camera=cameras(),
-    x=st.floats(-0.4, 0.4),
-    y=st.floats(-0.4, 0.4),
-    water_m=st.floats(0.3, 20.0),
+    camera=cameras(), x=st.floats(-0.4, 0.4), y=st.floats(-0.4, 0.4), water_m=st.floats(0.3, 20.0)
 )
 def test_project_agrees_with_the_shortest_optical_path(
     camera: Camera, x: float, y: float, water_m: float

@@ -23,6 +23,8 @@ from camera_calib.triangulate import Triangulation
 from tests.cameras import changed, flat_port_camera
 from tests.oracles_interface import Tank, behind_interface
 
+pytestmark = pytest.mark.slow
+
 PUBLISHED_MEDIAN_PX = 4.65
 """Of the sum of both cameras' errors: 2.13 + 2.49 px."""
 N_WATER = 1.333

@@ -11,12 +11,7 @@ from alice_survey.core.config import Jerlov
 from alice_survey.core.errors import ConfigError
 from alice_survey.core.seawater import n_water
 from camera_calib.camera import Camera
-from camera_calib.water import (
-    channel_cameras,
-    diffuse_attenuation_per_m,
-    n_glass,
-    water_optics,
-)
+from camera_calib.water import channel_cameras, diffuse_attenuation_per_m, n_glass, water_optics
 from tests.cameras import MANTA, changed
 
 JERLOV_1976_PER_M = {

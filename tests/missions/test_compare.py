@@ -18,19 +18,7 @@ from alice_survey.core.executor import SERIAL
 from alice_survey.sim.vehicle import vehicle as files
 from alice_survey.sim.vehicle.sea import level_floor
 from alice_survey.sim.vehicle.simulator import Flown, Setup, simulate
-from missions.fly.compare import (
-    EQUAL,
-    IMPROVED,
-    ORIGINAL,
-    VARIANTS,
-    Case,
-    compare_report,
-    default_cases,
-    figures_of,
-    fly_variant,
-    turn_rows,
-    variants_of,
-)
+from missions.fly import compare
 from missions.fly.simulation import flight_settings, mission_setup, with_values
 from missions.values.flight import Flight
 from missions.values.plan_file import Plan
@@ -39,8 +27,8 @@ from tests.missions.flown_plans import planned
 from tests.oracles_guidance import los_offset_m
 
 HEAVY = str(Path(files.__file__).parent / "fleet_files" / "bluerov2_heavy.toml")
-STILL = Case(current_mps=0.0, towards_deg=0.0)
-BY_NAME = {variant.name: variant for variant in VARIANTS}
+STILL = compare.Case(current_mps=0.0, towards_deg=0.0)
+BY_NAME = {variant.name: variant for variant in compare.VARIANTS}
 Flights = dict[str, tuple[Setup, Flown, Flight]]
 
 
@@ -62,10 +50,10 @@ def small() -> Plan:
 @pytest.fixture(scope="module")
 def flown(small: Plan) -> Flights:
     """The three in a current to starboard, with the same draws of chance."""
-    case = Case(current_mps=0.05, towards_deg=90.0)
+    case = compare.Case(current_mps=0.05, towards_deg=90.0)
     return {
-        name: fly_variant(SETTINGS, small, BY_NAME[name], case, 3)
-        for name in (ORIGINAL, EQUAL, IMPROVED)
+        name: compare.fly_variant(SETTINGS, small, BY_NAME[name], case, 3)
+        for name in (compare.ORIGINAL, compare.EQUAL, compare.IMPROVED)
     }
 
 
@@ -102,7 +90,7 @@ def test_all_meet_the_same_gusts(small: Plan) -> None:
 
 def test_figures_are_of_what_was_flown(flown: Flights) -> None:
     for _, run, flight in flown.values():
-        figures = figures_of(flight)
+        figures = compare.figures_of(flight)
         cross, _ = flight.line_errors
         on = ~np.isnan(cross)
         assert on.any()
@@ -113,10 +101,10 @@ def test_figures_are_of_what_was_flown(flown: Flights) -> None:
         assert figures.complete == (flight.ending == "complete")
         roll_deg = np.rad2deg(np.abs(flight.attitude_rad[:, 0]))
         assert 0.0 < figures.turn_roll_peak_deg <= roll_deg.max()
-    found = {name: figures_of(run[2]) for name, run in flown.items()}
-    assert found[IMPROVED].lines_believed_m < 0.05
-    assert found[ORIGINAL].lines_believed_m > 3.0 * found[IMPROVED].lines_believed_m
-    assert found[IMPROVED].heading_rms_deg < 3.0 < found[ORIGINAL].heading_rms_deg
+    found = {name: compare.figures_of(run[2]) for name, run in flown.items()}
+    assert found[compare.IMPROVED].lines_believed_m < 0.05
+    assert found[compare.ORIGINAL].lines_believed_m > 3.0 * found[compare.IMPROVED].lines_believed_m
+    assert found[compare.IMPROVED].heading_rms_deg < 3.0 < found[compare.ORIGINAL].heading_rms_deg
 
 
 def test_the_original_settles_where_the_closed_form_has_it() -> None:
@@ -125,8 +113,10 @@ def test_the_original_settles_where_the_closed_form_has_it() -> None:
     # Fixes from above would shift the line under the vehicle.
     config = change_section(config, "navigation", usbl_noise_m=0.0)
     plan = planned(config)
-    case = Case(current_mps=0.05, towards_deg=90.0)
-    setup, _, flight = fly_variant(flight_settings(config), plan, BY_NAME[ORIGINAL], case, 1)
+    case = compare.Case(current_mps=0.05, towards_deg=90.0)
+    setup, _, flight = compare.fly_variant(
+        flight_settings(config), plan, BY_NAME[compare.ORIGINAL], case, 1
+    )
     rows = np.flatnonzero(flight.line == 0)
     settled = flight.believed_cross_track[rows[-len(rows) // 4 :]]
     ahead = math.cos(plan.lines[0].heading_rad)
@@ -138,15 +128,15 @@ def test_the_original_settles_where_the_closed_form_has_it() -> None:
 def test_turns_are_from_a_line_to_the_middle_of_the_next() -> None:
     line = np.array([-1, -1, 0, 0, 0, -1, -1, 1, 1, 1, 1, -1, 2, 2, -1], np.float64)
     following = np.ones(len(line), bool)
-    assert turn_rows(line, following) == [slice(5, 9), slice(11, 13)]
+    assert compare.turn_rows(line, following) == [slice(5, 9), slice(11, 13)]
     # A way back to where the line was left is not a turn.
     again = np.array([0, 0, -1, 0, 0], np.float64)
-    assert turn_rows(again, np.ones(5, bool)) == []
-    assert turn_rows(np.full(4, -1.0), np.ones(4, bool)) == []
+    assert compare.turn_rows(again, np.ones(5, bool)) == []
+    assert compare.turn_rows(np.full(4, -1.0), np.ones(4, bool)) == []
 
 
 def test_currents_are_across_along_and_none(small: Plan) -> None:
-    cases = default_cases(small)
+    cases = compare.default_cases(small)
     turned = [math.radians(case.towards_deg) - small.lines[0].heading_rad for case in cases[:2]]
     assert math.sin(turned[0]) == pytest.approx(1.0)
     assert math.cos(turned[1]) == pytest.approx(1.0)
@@ -154,9 +144,10 @@ def test_currents_are_across_along_and_none(small: Plan) -> None:
     assert [case.swell_m > 0 for case in cases] == [False, False, False, True]
 
 
+@pytest.mark.slow
 def test_the_report_holds_every_flight_next_to_the_paper(tmp_path: Path) -> None:
     currents = ["0.05@90", "0@0"]
-    _, data = compare_report(
+    _, data = compare.compare_report(
         CONFIG, tmp_path / "one", currents=currents, seed=4, flights=1, executor=SERIAL
     )
     assert json.loads((tmp_path / "one" / "compare.json").read_text()) == data
@@ -164,7 +155,7 @@ def test_the_report_holds_every_flight_next_to_the_paper(tmp_path: Path) -> None
     assert all(set(case["variants"]) == set(BY_NAME) for case in data["cases"])
     assert data["paper"]["improved"]["cross_track_rms_m"] == [0.12, 0.12]
     _, rows = read_csv(tmp_path / "one" / "flights.csv")
-    assert len(rows) == 2 * len(VARIANTS)
+    assert len(rows) == 2 * len(compare.VARIANTS)
     for _, row in rows:
         current = f"{float(row['current_mps']):g}@{float(row['towards_deg']):g}"
         case = data["cases"][currents.index(current)]
@@ -175,7 +166,7 @@ def test_the_report_holds_every_flight_next_to_the_paper(tmp_path: Path) -> None
 
 def test_any_vehicles_are_compared(tmp_path: Path) -> None:
     """Each as it can be steered, under its own name; the paper's figures are left out."""
-    text, data = compare_report(
+    text, data = compare.compare_report(
         CONFIG, tmp_path, currents=["0.05@90"], seed=4, flights=1, executor=SERIAL,
         vehicles=["sparus2", HEAVY],
     )  # fmt: skip
@@ -188,9 +179,9 @@ def test_any_vehicles_are_compared(tmp_path: Path) -> None:
     assert "paper" not in text
     assert len(list(tmp_path.glob("*.png"))) == 1
     with pytest.raises(VehicleError, match="two have one name"):
-        variants_of(["bluerov2_heavy", HEAVY])
+        compare.variants_of(["bluerov2_heavy", HEAVY])
     with pytest.raises(VehicleError, match="'nautilus' is not known"):
-        variants_of(["nautilus"])
+        compare.variants_of(["nautilus"])
 
 
 def test_the_command_prints_what_it_writes(tmp_path: Path) -> None:

@@ -38,6 +38,7 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_flight_is_the_same_bytes_each_time_and_another_with_another_seed(
     workspace: Path, tmp_path: Path
 ) -> None:

@@ -155,6 +155,7 @@ def test_strips_show_errors_thrusters_and_power(
     assert spent_j == pytest.approx(flight.flown.energy_j.sum(), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_navigation_is_consistent_in_the_closed_loop() -> None:
     """Normalised errors squared of the position, averaged over runs (Y. Bar-Shalom et al., 2001).
 

@@ -11,13 +11,7 @@ from alice_survey.core.executor import local_executor
 from alice_survey.core.records import PortRecord
 from camera_calib.rig import Rig, read_rig
 from tests.reconstruct.rig_calibration import calibrated_rig, errors_over_sigmas
-from tests.reconstruct.rig_survey import (
-    MOMENTS,
-    RigScore,
-    import_survey,
-    render_survey,
-    score,
-)
+from tests.reconstruct.rig_survey import MOMENTS, RigScore, import_survey, render_survey, score
 
 LINES = 2
 NAMES = ("wide", "tele", "bow", "side")

@@ -40,9 +40,7 @@ def warped_scene(
 
 
 def started(
-    scene: Scene,
-    rng: int | np.random.Generator = 1,
-    error: tuple[float, float] = POSE_ERROR,
+    scene: Scene, rng: int | np.random.Generator = 1, error: tuple[float, float] = POSE_ERROR
 ) -> tuple[Mapped, Observations]:
     """A model that starts near the truth, and what its pinholes see."""
     seen, warps = warped_scene(scene)

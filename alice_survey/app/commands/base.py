@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import typer
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, PrivateAttr
 
 from alice_survey.core.errors import ConfigError, note
 
@@ -61,6 +61,7 @@ class CommandModel(BaseModel):
     """What it does, in words; only where the studio offers it."""
     offered: ClassVar[Sequence[str]] = ()
     """Fields that a page of the studio may set."""
+    _said: str = PrivateAttr("")
     quiet: bool = option(False, "Show warnings, errors and the result alone.", "-q", "--quiet")
     log_file: list[Path] | None = option(
         None, "Add all that happens to this file, as lines of JSON.",
@@ -108,11 +109,24 @@ class CommandModel(BaseModel):
         parts = (data, *data.values()) if isinstance(data, dict) else ()
         return not any(isinstance(part, dict) and part.get("shortfall") for part in parts)
 
+    def say(self, text: str) -> None:
+        """Print what the text of the result begins with, before the command ends."""
+        from alice_survey.core.run.progress import current
+
+        if not getattr(self, "as_json", False):
+            with current().paused_bars():
+                typer.echo(text)
+            self._said = text
+
     def show(self, text: str, data: Any) -> None:
         """Print a result."""
         from alice_survey.core.run.progress import current
 
-        typer.echo(json.dumps(data, indent=2) if getattr(self, "as_json", False) else text)
+        remaining = text.removeprefix(self._said).lstrip("\n") if self._said else text
+        if getattr(self, "as_json", False):
+            typer.echo(json.dumps(data, indent=2))
+        elif remaining or not self._said:
+            typer.echo(remaining)
         current().report("result", text)
 
 

@@ -48,8 +48,9 @@ class PlanCommand(SurveyCommand):
         from alice_survey.app.pipeline import plan_report
 
         return plan_report(
-            self.workspace, self.survey, every_setting=self.every_setting, vehicle=self.vehicle
-        )
+            self.workspace, self.survey,
+            every_setting=self.every_setting, vehicle=self.vehicle, say=self.say,
+        )  # fmt: skip
 
 
 class SolveCommand(SurveyCommand):

@@ -146,8 +146,9 @@ class FlyCommand(SurveyCommand):
             },
         }  # fmt: skip
         return run(
-            ["fly"], self.workspace, self.survey, changes=changes, edited_mission=self.edited
-        )
+            ["fly"], self.workspace, self.survey, changes=changes, edited_mission=self.edited,
+            say=lambda text, _: self.say(text),
+        )  # fmt: skip
 
 
 class ImageCommand(ClusterCommand):

@@ -16,7 +16,6 @@ from alice_survey.core.frames import Array
 from alice_survey.core.records import MeshRecord
 from alice_survey.core.run import progress
 from alice_survey.kit.document import Figure, Mesh
-from alice_survey.kit.figure import shrunk_png
 from alice_survey.kit.words import count
 
 _MAX_TRIANGLES = 250_000
@@ -28,6 +27,8 @@ _QUALITY = 80
 @progress.step("thin the mesh")
 def mesh_copy(held: Held, glb: Path) -> Mesh | None:
     """Write a light copy to `glb`; None where there is no mesh, or one too large and no mosaic."""
+    from alice_survey.kit.figure import shrunk_png
+
     mesh = held.read(MeshRecord)
     if mesh is None:
         return None

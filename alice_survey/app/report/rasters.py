@@ -25,7 +25,7 @@ from alice_survey.app.report.held import Held
 from alice_survey.core.frames import Array
 from alice_survey.core.products import MOSAIC, RASTERS, Raster
 from alice_survey.kit.document import PictureLayer, Scale
-from alice_survey.kit.figure import even_limit, palette_colours, palette_steps
+from alice_survey.kit.map import even_limit
 from reconstruct.measure.surface import is_of_surface
 from reconstruct.raster import hillshade
 
@@ -229,6 +229,8 @@ class Pyramid:
             values: (H, W), NaN where unknown.
             pixel: side of a pixel in the unit of lengths, for the shade.
         """
+        from alice_survey.kit.figure import palette_colours
+
         level, (low, high) = self._levels(values), self.limits or (0.0, 1.0)
         shares = np.clip((level - low) / (high - low), 0, 1)
         picture: Rgba = palette_colours(self.raster.palette, shares)
@@ -245,6 +247,8 @@ class Pyramid:
         """The legend; None of the mosaic, which has its own colours."""
         if self.limits is None:
             return None
+        from alice_survey.kit.figure import palette_steps
+
         title, (low, high) = self.raster.title.lower(), self.limits
         label = f"{title}, {self._unit}" if self._unit else title
         colours = palette_steps(self.raster.palette, _COLOURS)

@@ -9,7 +9,6 @@ from typing import Any
 from alice_survey.app.report.held import Held
 from alice_survey.app.report.mesh_copy import mesh_copy
 from alice_survey.app.report.rasters import picture_layers
-from alice_survey.app.report.sections import sections
 from alice_survey.app.report.shapes import shape_layers
 from alice_survey.app.report.verdicts import facts, summary, verdicts
 from alice_survey.core.artefacts import STAGE_FILE, atomic_path, json_values
@@ -17,12 +16,13 @@ from alice_survey.core.executor import Executor
 from alice_survey.core.records import ReportRecord
 from alice_survey.core.run import progress
 from alice_survey.kit.document import OWN_AXES, PictureLayer, Report, ShapeLayer, SurveyMap
-from alice_survey.kit.page import render_html
-from alice_survey.kit.paper import render_pdf, with_stills
 
 
 def run_report(workspace: Path, folder: Path, executor: Executor) -> None:
     """Write the report of what the workspace holds."""
+    from alice_survey.kit.page import render_html
+    from alice_survey.kit.paper import render_pdf
+
     held = Held.of(workspace)
     report, data = build_report(held, folder)
     with progress.step("write the page"), atomic_path(folder / "report.html") as path:
@@ -41,6 +41,9 @@ def build_report(held: Held, folder: Path) -> tuple[Report, dict[str, Any]]:
         held: the workspace.
         folder: for the mesh's light copy.
     """
+    from alice_survey.app.report.sections import sections  # here, as the studio uses this module
+    from alice_survey.kit.paper import with_stills
+
     found = verdicts(held)
     said, known = summary(held, found), facts(held)
     with progress.step("draw the maps"):

@@ -150,6 +150,17 @@ class Run:
             for handler in self._handlers:
                 handler.close()
 
+    @contextlib.contextmanager
+    def paused_bars(self) -> Iterator[None]:
+        """Take the bars off the terminal while the caller writes to it."""
+        with self._lock:
+            if self._bars.disable:
+                yield
+                return
+            self._bars.stop()
+            yield
+            self._bars.start()
+
     def report(self, name: str, message: str | None = None, **facts: Any) -> None:
         """Report an event; its time is that of the run unless the facts say otherwise."""
         with self._lock:

@@ -26,13 +26,14 @@ _PACKAGES = {
     "alice-survey": "alice-survey",
     "numpy": "numpy",
     "scipy": "scipy",
-    "opencv": "opencv-contrib-python-headless",
+    "opencv-contrib-python-headless": "opencv",
     "pycolmap": "pycolmap",
     "open3d": "open3d",
+    "open3d-cpu": "open3d",
     "numba": "numba",
     "rasterio": "rasterio",
 }
-"""Packages that affect results, and the distributions that contain them."""
+"""Distributions of the packages that affect results, and their names."""
 
 
 _elsewhere_s = 0.0
@@ -167,7 +168,7 @@ def processor() -> str:
 def versions() -> dict[str, str]:
     """Versions of the installed packages that affect results."""
     found = {}
-    for name, distribution in _PACKAGES.items():
+    for distribution, name in _PACKAGES.items():
         with contextlib.suppress(metadata.PackageNotFoundError):
             found[name] = metadata.version(distribution)
     return found

@@ -7,6 +7,7 @@ waves and stays where it is compared with them, so that all of it meets one phas
 motion, small near the floor, is left out.
 """
 
+import itertools
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -68,14 +69,13 @@ def varying_current(
         duration_s: duration.
         rng: source of the process.
     """
-    from scipy.signal import lfilter
-
     step_s = correlation_s / 10.0
     time_s: Array = step_s * np.arange(math.ceil(duration_s / step_s) + 2, dtype=np.float64)
     decay = math.exp(-step_s / correlation_s)
-    draws = rng.standard_normal((len(time_s), 2))
-    draws[1:] *= math.sqrt(1 - decay**2)
-    process = lfilter([1.0], [1.0, -decay], draws, axis=0)
+    process = rng.standard_normal((len(time_s), 2))
+    process[1:] *= math.sqrt(1 - decay**2)
+    for before, now in itertools.pairwise(process):
+        now += decay * before
     velocity = mean.velocity_ne_mps + sigma_mps * process[:, None, :]
     return check_current(Current(time_s, mean.depth_m, np.array(velocity, dtype=np.float64)))
 

@@ -43,10 +43,7 @@ def test_the_parts_of_the_noise_and_the_covariance_are_those_of_dense_matrices()
             pixels += together[v] * lean[:, :1] * lean[:, 1:]
     views[1].pixels["left"][2:5] = np.nan
     del views[3].pixels["right"]  # type: ignore[attr-defined]
-    freedom, shape = (
-        Freedom(free=(*of_ports(TRUTH), *pose_names(TRUTH))),
-        usual_shape(points),
-    )
+    freedom, shape = (Freedom(free=(*of_ports(TRUTH), *pose_names(TRUTH))), usual_shape(points))
     found = adjust(views, points, TRUTH, poses, freedom, shape=shape)
     problem = CalibrationProblem(
         stack_views(views, TRUTH, len(points)), points, TRUTH, freedom, shape
@@ -94,6 +91,7 @@ def test_places_of_corners_are_found_with_their_size_and_stated() -> None:
     assert levels(run_trial(0, bent, AS_DRAWN)) == {"in": "good", "across": "look"}
 
 
+@pytest.mark.slow
 def test_noise_is_no_uneven_print_and_a_bend_that_was_not_adjusted_lies_across_the_target() -> None:
     def places_m(seed: int, target: Board, *shape: TargetShape) -> tuple[float, float]:
         found = run_trial(seed, target, *shape).spread
@@ -136,6 +134,7 @@ def test_sigmas_cover_the_errors(name: str) -> None:
         assert 1.0 <= case.sigma_growth < MAX_GROWTH
 
 
+@pytest.mark.slow
 def test_halves_of_the_views_agree_by_their_covariances() -> None:
     found, alone = [], []
     for seed in range(10):

@@ -149,6 +149,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("camera_calib.calibrate.results.write_report", without_plots)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick")
 def test_from_dry_pictures_through_the_ports(
     dry: Path, wet: Path, truth: Rig, tmp_path: Path
@@ -299,6 +300,7 @@ def test_what_others_need_is_not_replaced(tmp_path: Path) -> None:
     assert start.is_file()
 
 
+@pytest.mark.slow
 def test_swapped_lists_are_reported_first(dry: Path, tmp_path: Path) -> None:
     swapped = {"cameras": (f"left={dry / 'right'}", f"right={dry / 'left'}")}
     for pictures, is_bad in ((both(dry), False), (swapped, True)):

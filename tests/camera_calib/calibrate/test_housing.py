@@ -70,6 +70,7 @@ def test_the_housing_is_found(port: PortValues, kind: str, ratio: float) -> None
 BARE = CalibrateOptions(water=True, port="none")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "port", "named"),
     [

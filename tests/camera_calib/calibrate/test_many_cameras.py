@@ -99,6 +99,7 @@ def test_a_part_of_a_rig_has_the_covariance_of_its_own_poses() -> None:
     assert whole.sigmas == pytest.approx(dict(zip(fields, np.abs(step), strict=True)), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_four_lenses_behind_four_ports_are_found_in_air_and_then_in_water() -> None:
     wet, rng = four_cameras(), np.random.default_rng(8)
     dry = in_air(wet)

@@ -16,6 +16,7 @@ DOME = CameraConfig(
 )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lens", ["opencv", "fisheye"])
 def test_a_dome_is_calibrated_in_air_and_in_the_pool(lens: str, tmp_path: Path) -> None:
     camera = DOME.model_copy(update={"lens": lens})

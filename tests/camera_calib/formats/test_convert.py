@@ -51,12 +51,7 @@ FULL = replace(BENT, covariance=covariance_of(BENT, np.random.default_rng(4)))
 IN_AIR = in_air(BENT)
 PLACES = {name: RigidTransform.from_translation([0.1 * i, 0, 0]) for i, name in enumerate("abc")}
 THREE = replace(IN_AIR, cameras=dict.fromkeys(PLACES, IN_AIR.cameras["left"]), cam_from_rig=PLACES)
-CHANNELS = {
-    "opencv": "o.xml",
-    "colmap": "model",
-    "refractive": "flat",
-    "kalibr": "c.yaml",
-}
+CHANNELS = {"opencv": "o.xml", "colmap": "model", "refractive": "flat", "kalibr": "c.yaml"}
 
 
 def convert_files(
@@ -295,10 +290,7 @@ def test_names_can_be_chosen(own: Path, tmp_path: Path) -> None:
 
 def test_a_name_of_a_camera_cannot_lead_out_of_the_folder(own: Path, tmp_path: Path) -> None:
     data = json.loads(own.read_text())
-    data["cameras"] = {
-        "left": data["cameras"]["left"],
-        "../../outside": data["cameras"]["right"],
-    }
+    data["cameras"] = {"left": data["cameras"]["left"], "../../outside": data["cameras"]["right"]}
     del data["covariance"]
     own.write_text(json.dumps(data))
     for name, target in CHANNELS.items():

@@ -14,25 +14,20 @@ from camera_calib.formats.convert import detect
 from camera_calib.formats.rigs import ReadOptions
 from camera_calib.formats.yaml_files import read_kalibr, write_kalibr
 from camera_calib.rig import Rig
-from tests.strategies_formats import (
-    BOTH_LENSES,
-    DATA,
-    POINTS_RIG,
-    RADTAN,
-    assert_same_pixels,
-    fault_of,
-    opencv_pixels,
-    rigs,
-)
+from tests import strategies_formats
 
-EXAMPLE = (DATA / "camchain.yaml").read_text()
+EXAMPLE = (strategies_formats.DATA / "camchain.yaml").read_text()
 
 
-fault = partial(fault_of, read_kalibr)
+fault = partial(strategies_formats.fault_of, read_kalibr)
 
 
 @settings(max_examples=50, deadline=None)
-@given(rig=rigs(RADTAN, lenses=BOTH_LENSES, maximum=3))
+@given(
+    rig=strategies_formats.rigs(
+        strategies_formats.RADTAN, lenses=strategies_formats.BOTH_LENSES, maximum=3
+    )
+)
 def test_opencv_projects_as_we_do_from_the_chain(rig: Rig) -> None:
     """Kalibr's radtan and equidistant are OpenCV's first four terms and its fisheye."""
     with tempfile.TemporaryDirectory() as folder:
@@ -52,15 +47,15 @@ def test_opencv_projects_as_we_do_from_the_chain(rig: Rig) -> None:
         assert ("T_cn_cnm1" in entry) == (i > 0)
         cam_from_rig = np.array(entry.get("T_cn_cnm1", np.eye(4))) @ cam_from_rig
         fx, fy, cx, cy = entry["intrinsics"]
-        seen = opencv_pixels(
-            POINTS_RIG,
+        seen = strategies_formats.opencv_pixels(
+            strategies_formats.POINTS_RIG,
             Rotation.from_matrix(cam_from_rig[:3, :3]).as_rotvec(),
             cam_from_rig[:3, 3],
             np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]),
             np.pad(entry["distortion_coeffs"], (0, 0 if is_fisheye else 1)),
         )
-        ours = camera.project(rig.cam_from_rig[name].apply(POINTS_RIG))
-        assert_same_pixels(ours, seen + 0.5)
+        ours = camera.project(rig.cam_from_rig[name].apply(strategies_formats.POINTS_RIG))
+        strategies_formats.assert_same_pixels(ours, seen + 0.5)
 
 
 def test_an_example_like_that_of_the_wiki_is_read(

@@ -5,11 +5,7 @@ import pytest
 
 from alice_survey.core.config import CameraConfig
 from alice_survey.core.errors import ConfigError
-from camera_calib.fov.display import (
-    draw_fov,
-    fov_csv_rows,
-    fov_text,
-)
+from camera_calib.fov.display import draw_fov, fov_csv_rows, fov_text
 from camera_calib.fov.table import blur_table, fov_table
 
 PORT = CameraConfig()

@@ -19,11 +19,7 @@ from camera_calib.judge.report import write_report
 from camera_calib.judge.uncertainty import uncertainty_report
 from camera_calib.rig import write_rig
 from camera_calib.targets.target import Rejection
-from tests.oracles_report import (
-    DESIGN,
-    usual,
-    usual_held_out,
-)
+from tests.oracles_report import DESIGN, usual, usual_held_out
 
 NASTY = '<script>alert("x")</script>&$x_1$.png'
 PNG = re.compile(r'src="data:image/png;base64,([^"]+)"')

@@ -16,6 +16,7 @@ from tests.oracles_targets import picture_light, seen_from, to_srgb, true_pixels
 
 SIZE = (640, 480)
 NOISE = 0.01
+SLOW = pytest.mark.slow
 KINDS = ["chessboard 9x6 25mm", "charuco 8x6 40mm 30mm DICT_4X4_50", "apriltag 4x3 88mm 0.3"]
 TURNS = [(0, 0, 0), (30, 20, 10), (-55, 0, 80), (10, 55, 170), (40, -35, -60)]
 
@@ -47,7 +48,7 @@ def misses(found: Detection, true: np.ndarray) -> np.ndarray:
     return off[np.isfinite(off).all(axis=1)]
 
 
-@pytest.mark.parametrize("text", KINDS)
+@pytest.mark.parametrize("text", [KINDS[0], *(pytest.param(k, marks=SLOW) for k in KINDS[1:])])
 def test_points_are_found_to_a_hundredth_of_a_pixel(text: str) -> None:
     off, sigmas, count = [], [], 0
     for turn in TURNS:
@@ -195,7 +196,7 @@ def test_what_was_dropped_is_counted() -> None:
     assert rejection.points == np.isnan(found.pixels[:, 0]).sum() >= 1
 
 
-@pytest.mark.parametrize("turn", [10, 100, 190, 280])
+@pytest.mark.parametrize("turn", [10, *(pytest.param(t, marks=SLOW) for t in (100, 190, 280))])
 @pytest.mark.parametrize("text", [*KINDS, "chessboard 7x7 25mm"])
 def test_numbering_follows_the_board_not_the_picture(text: str, turn: int) -> None:
     target, picture, true = view(text, (0, 0, turn), noise=0.0, fill=0.6)
@@ -240,6 +241,7 @@ def test_a_bent_picture_is_no_hindrance(text: str) -> None:
     assert np.sqrt(np.mean(off**2)) < 0.03
 
 
+@pytest.mark.slow
 def test_large_pictures_are_searched_small_and_fitted_whole() -> None:
     target = parse_target("charuco 8x6 40mm 30mm DICT_4X4_50")
     size = (2600, 2000)
@@ -251,6 +253,7 @@ def test_large_pictures_are_searched_small_and_fitted_whole() -> None:
     assert 1e-4 < np.sqrt(np.mean(off**2)) < 0.015
 
 
+@pytest.mark.slow
 def test_all_real_stereo_pictures_are_read(shared_data: Path) -> None:
     target = parse_target("chessboard 9x6 25mm")
     views: dict[str, list[np.ndarray]] = {"left": [], "right": []}
@@ -272,6 +275,7 @@ def test_all_real_stereo_pictures_are_read(shared_data: Path) -> None:
     assert 0.05 < rms < 0.2
 
 
+@pytest.mark.slow
 def test_all_real_pictures_with_glare_are_read(shared_data: Path) -> None:
     target = parse_target("chessboard 9x6 9.35mm")
     folder = shared_data / "aau_flat_interface" / "checkerboards"

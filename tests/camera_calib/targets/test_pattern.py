@@ -1,5 +1,7 @@
 """What is black around a target's points, and corners that are fitted with it."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -40,6 +42,7 @@ def test_a_chessboard_has_nothing_but_its_edges() -> None:
     assert surroundings(parse_target("chessboard 9x6 25mm")) is CROSSING
 
 
+@cache
 def fisheye_view() -> tuple[np.ndarray, np.ndarray]:
     """Light of a grid near the edge of a fisheye's frame, and its points; tags are 25 px wide."""
     turn = Rotation.from_euler("xyz", [15.0, 30.0, 20.0], degrees=True)

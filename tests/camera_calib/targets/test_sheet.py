@@ -12,11 +12,7 @@ from camera_calib.targets.detect import detect
 from camera_calib.targets.sheet import BAR_MM, PAPERS_MM, lay_out, write_sheet
 from camera_calib.targets.target import Target, parse_target
 
-KINDS = [
-    "chessboard 7x4 20mm",
-    "charuco 7x5 20mm 15mm DICT_4X4_50",
-    "apriltag 3x2 40mm 0.3",
-]
+KINDS = ["chessboard 7x4 20mm", "charuco 7x5 20mm 15mm DICT_4X4_50", "apriltag 3x2 40mm 0.3"]
 MM_PER_POINT = 25.4 / 72.0
 
 

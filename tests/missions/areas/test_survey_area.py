@@ -122,9 +122,7 @@ def test_parts_join_where_their_margins_meet() -> None:
     assert len(area_of(wkt=wkt, turn_margin_m=3.0 + 7.0).allowed.geoms) == 1
 
 
-def test_an_allowed_area_may_leave_out_some_but_not_all(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_an_allowed_area_may_leave_out_some_but_not_all(capsys: pytest.CaptureFixture[str]) -> None:
     area = area_of(polygon_ne_m=SQUARE, allowed_ne_m=((-5, -5), (5, -5), (5, 15), (-5, 15)))
     warning = capsys.readouterr().err
     assert "50.00%" in warning
@@ -145,10 +143,7 @@ def test_an_allowed_area_may_leave_out_some_but_not_all(
         ({**RING, "latitude_deg": 10.0}, "longitude_deg"),
         ({**RING, "latitude_deg": 32.0, "longitude_deg": 34.0}, r"1 at \(10, 20\) is \d+ km"),
         # Latitude and longitude are swapped.
-        (
-            {**RING, "latitude_deg": 20.0, "longitude_deg": 10.0},
-            r"2 at \(10, 20\.001\) is \d+ km",
-        ),
+        ({**RING, "latitude_deg": 20.0, "longitude_deg": 10.0}, r"2 at \(10, 20\.001\) is \d+ km"),
         ({"polygon_latlon_deg": ((10, 20), (10, 21), (11, 20))}, r"corner \d at .* km"),
         ({"polygon_ne_m": ((0, 0), (10, 0), (10, 1e6))}, r"corner 3 .* is 1000 km"),
     ],

@@ -359,6 +359,7 @@ def test_cells_inside_are_those_whose_middle_is_inside(shape: MultiPolygon) -> N
     assert np.all(cells.max(axis=0) <= np.array(grid.shape) + 1e-6)
 
 
+@pytest.mark.slow
 def test_tiles_chunks_and_threads_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     area = area_of(Polygon([(0, 0), (6, 1), (5, 6), (-1, 4)]))
     stations = wandering(50, 3)

@@ -72,9 +72,7 @@ def test_a_dive_is_compared_with_its_plan(checked: tuple[Path, str, dict]) -> No
     assert written == {key: data[key] for key in written}
 
 
-def test_the_map_and_the_outlines_lie_where_the_hole_is(
-    checked: tuple[Path, str, dict],
-) -> None:
+def test_the_map_and_the_outlines_lie_where_the_hole_is(checked: tuple[Path, str, dict]) -> None:
     workspace, _, data = checked
     with rasterio.open(workspace / "check" / "coverage.tif") as raster:
         assert raster.crs.to_epsg() == DATUM.utm_epsg
@@ -98,9 +96,7 @@ def test_the_map_and_the_outlines_lie_where_the_hole_is(
     assert (workspace / "check" / "coverage.png").is_file()
 
 
-def test_the_plan_for_the_holes_is_whole_and_closes_them(
-    checked: tuple[Path, str, dict],
-) -> None:
+def test_the_plan_for_the_holes_is_whole_and_closes_them(checked: tuple[Path, str, dict]) -> None:
     workspace, _, data = checked
     again = read_plan(workspace / "check" / "refly" / "plan" / "plan.json")
 

@@ -127,9 +127,7 @@ def test_lines_end_at_the_edge_of_the_allowed_area(tmp_path: Path) -> None:
     np.testing.assert_allclose(end, (4.9, 0.0), atol=MM)
 
 
-def test_the_tolerance_keeps_neighbouring_lines_together(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_tolerance_keeps_neighbouring_lines_together(monkeypatch: pytest.MonkeyPatch) -> None:
     # Never COLA2's 1.5 m, never less than what a vehicle holds.
     assert line_tolerance_m(small_plan(line_spacing_m=1.26), RIG) == 0.12
     monkeypatch.setattr(options, "MIN_TOLERANCE_M", 0.01)

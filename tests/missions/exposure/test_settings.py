@@ -8,12 +8,7 @@ from hypothesis import strategies as st
 
 from alice_survey.core.errors import PlanError
 from missions.exposure.footprints import pixel_on_floor_m
-from missions.exposure.settings import (
-    blur_rates,
-    exposure_for_rate,
-    imaging_settings,
-    paper_rule,
-)
+from missions.exposure.settings import blur_rates, exposure_for_rate, imaging_settings, paper_rule
 from missions.values.footprint import footprint_size_m
 from tests.missions.exposure.surveys import conflict_of, survey
 from tests.oracles_imaging import moved_pixel

@@ -77,9 +77,7 @@ def test_progress_and_time_left_are_those_of_the_flight(reef: Path, pace: float)
     assert left[0] > left[-1]
 
 
-def test_a_gap_is_found_while_the_dive_goes_on_and_the_plan_proposed_closes_it(
-    reef: Path,
-) -> None:
+def test_a_gap_is_found_while_the_dive_goes_on_and_the_plan_proposed_closes_it(reef: Path) -> None:
     before = BROKEN[BROKEN[:, 0] < UNTIL_S]
     dive = followed(reef, before)
     state = dive.snapshot()

@@ -86,11 +86,7 @@ def test_a_strip_next_to_a_no_go_zone_is_filled_with_one_line() -> None:
 
 
 @settings(deadline=None, max_examples=25)
-@given(
-    seed=st.integers(0, 10**6),
-    pattern=st.sampled_from(PATTERNS),
-    turn=st.floats(0, math.pi),
-)
+@given(seed=st.integers(0, 10**6), pattern=st.sampled_from(PATTERNS), turn=st.floats(0, math.pi))
 def test_lines_over_pieces_see_them(seed: int, pattern: Pattern, turn: float) -> None:
     """Pieces as a dive leaves them: some strips and spots anywhere in the area."""
     rng = np.random.default_rng(seed)

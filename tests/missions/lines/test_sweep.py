@@ -36,7 +36,10 @@ def test_no_direction_is_narrower_than_the_least_width(
     ("shape", "costs", "count"),
     [
         *((shape, CALM, 400) for shape in (QUAD, ELL, box(0, 0, 15, 17))),
-        *((shape, NORTHWARD, 400) for shape in (QUAD, ELL, box(0, 0, 15, 17))),
+        *(
+            pytest.param(shape, NORTHWARD, 400, marks=pytest.mark.slow)
+            for shape in (QUAD, ELL, box(0, 0, 15, 17))
+        ),
         # The search leaves fill lines out until it compares the best headings.
         (ELL_WITH_HOLES, CALM, 120),
     ],

@@ -337,8 +337,7 @@ def diving(workspace: Path, navigator: Navigator) -> Iterator[subprocess.Popen[s
 def ends_without_thrust(pilot: subprocess.Popen[str], navigator: Navigator, depth: Any) -> None:
     navigator.until(lambda: pilot.poll() is not None, depth=depth)
     navigator.until(
-        lambda: not np.any(navigator.wrenches[-1]) and not np.any(navigator.speeds[-1]),
-        depth=None,
+        lambda: not np.any(navigator.wrenches[-1]) and not np.any(navigator.speeds[-1]), depth=None
     )
 
 

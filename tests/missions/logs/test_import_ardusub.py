@@ -250,7 +250,7 @@ def test_damage_costs_what_is_damaged_and_is_counted(tmp_path: Path) -> None:
     data = imported(log)
     assert data["rows"] == 20
     assert data["left_out"] == {
-        "bytes that are not a message, or of one that is cut off": 12 + len(att) - 5,
+        "bytes that are not a message, or of one that is cut off": 12 + len(att) - 5
     }
     log.write_bytes(whole[2000:])
     with pytest.raises(NavigationError, match=r"dive\.BIN"):
@@ -370,10 +370,7 @@ def test_other_files_are_refused_by_name(tmp_path: Path, name: str, content: str
 
 @pytest.mark.parametrize("form", ["dive.BIN", "dive.tlog"])
 def test_damaged_logs_end_in_a_table_or_in_one_line(tmp_path: Path, form: str) -> None:
-    whole = {
-        "dive.BIN": dataflash_log(dive_messages()),
-        "dive.tlog": tlog(telemetry()),
-    }[form]
+    whole = {"dive.BIN": dataflash_log(dive_messages()), "dive.tlog": tlog(telemetry())}[form]
     rng = np.random.default_rng(11)
     outcomes = []
     for _ in range(20):

@@ -13,16 +13,8 @@ from alice_survey.sim.vehicle.steady import steady_flight
 from alice_survey.sim.vehicle.vehicle import vehicle_from
 from missions.exposure.conflict import ConflictError
 from missions.plan.strength import current_error, held_current_mps, survey_costs
+from missions.route import energy
 from missions.route.dives import split_dives
-from missions.route.energy import (
-    FlightConditions,
-    Manner,
-    course_power,
-    flies_everywhere,
-    flight_conditions,
-    motion,
-    planned_vehicle,
-)
 from missions.route.turns import Manoeuvre
 from missions.values.costs import power_at
 from missions.values.line import Line
@@ -35,10 +27,10 @@ def _config(current: float = 0.1, towards: float = 90.0, **sections: Any) -> Sur
     return SurveyConfig.model_validate({"sea": sea, **sections})
 
 
-def conditions(config: SurveyConfig) -> FlightConditions:
+def conditions(config: SurveyConfig) -> energy.FlightConditions:
     depth_m = config.area.seafloor_depth_m - config.plan.altitude_m
     glass_body_m = config.camera.position_body_m
-    return flight_conditions(config.plan, config.vehicle, config.sea, depth_m, glass_body_m)
+    return energy.flight_conditions(config.plan, config.vehicle, config.sea, depth_m, glass_body_m)
 
 
 def test_drag_along_and_across_a_current() -> None:
@@ -52,9 +44,9 @@ def test_drag_along_and_across_a_current() -> None:
     body = flown.vehicle.plant.body
     bare = body._replace(lift=np.zeros(4))
 
-    def drag_w(off: float, manner: Manner) -> tuple[float, float, float]:
+    def drag_w(off: float, manner: energy.Manner) -> tuple[float, float, float]:
         courses = towards + off + np.array([0.0, math.pi])
-        moved = motion(courses, 0.2, flown.current_ne_mps, manner)
+        moved = energy.motion(courses, 0.2, flown.current_ne_mps, manner)
         drag = float(drag_power(bare, moved.nu).mean())
         crab = math.degrees(float(np.abs(moved.crab_rad).mean()))
         return drag, float(drag_power(body, moved.nu).mean()) - drag, crab
@@ -73,7 +65,7 @@ def test_motion_keeps_its_course_over_ground() -> None:
     courses = np.linspace(0, 2 * np.pi, 19)
     current = np.array([0.07, -0.05])
     for manner in ("held", "crab"):
-        moved = motion(courses, 0.2, current, manner)
+        moved = energy.motion(courses, 0.2, current, manner)
         heading = courses + moved.crab_rad
         north = moved.nu[:, 0] * np.cos(heading) - moved.nu[:, 1] * np.sin(heading) + current[0]
         east = moved.nu[:, 0] * np.sin(heading) + moved.nu[:, 1] * np.cos(heading) + current[1]
@@ -108,9 +100,11 @@ def test_without_a_current_all_courses_are_alike_and_ways_are_as_lines() -> None
 
 def test_power_between_samples_is_near_that_of_its_own_course() -> None:
     config = _config()
-    costs, craft = survey_costs(config), planned_vehicle(config.vehicle)
+    costs, craft = survey_costs(config), energy.planned_vehicle(config.vehicle)
     courses = np.random.default_rng(1).uniform(0, 2 * np.pi, 50)
-    exact = course_power(craft, courses, 0.2, conditions(config).current_ne_mps, "held") + 60.0
+    exact = (
+        energy.course_power(craft, courses, 0.2, conditions(config).current_ne_mps, "held") + 60.0
+    )
     near = [power_at(costs.line_w, course) for course in courses]
     np.testing.assert_allclose(near, exact, rtol=3e-3)
 
@@ -204,21 +198,21 @@ def test_a_current_above_the_vehicles_strength_is_refused_with_what_it_holds(
     assert name == "sea.current_mps"
     assert f"{held_mps:.2f} m/s" in found.limits[1]
     held = with_settings(config, {name: held_mps})
-    assert flies_everywhere(conditions(held))
+    assert energy.flies_everywhere(conditions(held))
     assert math.isfinite(survey_costs(held).stop_w)
 
 
 def test_what_is_held_is_the_most_that_flies() -> None:
     """A vehicle that crabs holds less than its speed: going downstream it would turn its back."""
 
-    def flown(current: float, name: str = "alice") -> FlightConditions:
+    def flown(current: float, name: str = "alice") -> energy.FlightConditions:
         return conditions(_config(current, math.degrees(0.3), vehicle={"name": name}))
 
     assert held_current_mps(flown(0.9, "sparus2")) == pytest.approx(0.2, abs=0.0101)
     assert held_current_mps(flown(0.1, "sparus2")) == pytest.approx(0.1)
     held = held_current_mps(flown(1.0))
-    assert flies_everywhere(flown(held))
-    assert not flies_everywhere(flown(held + 0.02))
+    assert energy.flies_everywhere(flown(held))
+    assert not energy.flies_everywhere(flown(held + 0.02))
 
 
 def test_a_heading_that_cannot_be_flown_is_refused_with_the_nearest_that_can() -> None:

@@ -18,20 +18,11 @@ from alice_survey.core.frames import Array
 from benchmarks.bend_pipeline import Adjusted, adjusted
 from camera_calib.freedom import POSE
 from camera_calib.rig import Rig
-from reconstruct.adjustment import exact_observations
+from reconstruct.adjustment import exact_observations, uncertainty
 from reconstruct.adjustment.exact_observations import Workers, exact_survey
 from reconstruct.adjustment.exact_observations import exact_observations as linearised
 from reconstruct.adjustment.normal_equations import Gauge, LinearObservations, reduce_points
 from reconstruct.adjustment.survey_fit import AdjustedSurvey, adjust_survey, fit_survey
-from reconstruct.adjustment.uncertainty import (
-    Motions,
-    Uncertainty,
-    estimate,
-    pinhole_survey,
-    read_uncertainty,
-    spread,
-    write_uncertainty,
-)
 from reconstruct.mapping.arrays import cross_matrices, frames_of, observations
 from reconstruct.mapping.bundle import cauchy_weights
 from reconstruct.mapping.mapper import Mapped
@@ -74,7 +65,7 @@ def test_errors_are_as_large_as_stated(tmp_path: Path) -> None:
     frames, points = [], []
     for seed in range(12):
         scene, mapped = drawn(seed, tmp_path)
-        found = estimate(mapped, scene.records)
+        found = uncertainty.estimate(mapped, scene.records)
         misses, point_misses = _away(mapped, found, scene)
         frames.append(misses / _sigmas(found.frame_cov))
         points.append(point_misses / _sigmas(found.point_cov))
@@ -115,11 +106,11 @@ def test_points_are_eliminated_as_dense_algebra_does(tmp_path: Path) -> None:
 
 def test_the_file_gives_back_what_was_written(tmp_path: Path) -> None:
     scene, mapped = drawn(2, tmp_path)
-    found = estimate(mapped, scene.records)
+    found = uncertainty.estimate(mapped, scene.records)
     for name in ("a.npz", "b.npz"):
-        write_uncertainty(tmp_path / name, found)
+        uncertainty.write_uncertainty(tmp_path / name, found)
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
-    back = read_uncertainty(tmp_path / "a.npz")
+    back = uncertainty.read_uncertainty(tmp_path / "a.npz")
     np.testing.assert_array_equal(back.frame_cov, found.frame_cov)
     np.testing.assert_array_equal(back.stations, found.stations)
     np.testing.assert_allclose(back.point_cov, found.point_cov, rtol=1e-6)
@@ -132,15 +123,15 @@ def test_the_file_gives_back_what_was_written(tmp_path: Path) -> None:
     with np.load(tmp_path / "a.npz") as data:
         np.savez(tmp_path / "c.npz", **{**data, "stations": np.array(["first"])})
     with pytest.raises(WorkspaceError, match="not as it was written"):
-        read_uncertainty(tmp_path / "c.npz")
+        uncertainty.read_uncertainty(tmp_path / "c.npz")
 
 
 def _observations(mapped: Mapped) -> LinearObservations:
-    pixels, state, *_ = pinhole_survey(mapped.model, frames_of(mapped.model))
+    pixels, state, *_ = uncertainty.pinhole_survey(mapped.model, frames_of(mapped.model))
     return linearised(state, pixels, ())
 
 
-def _away(mapped: Mapped, found: Uncertainty, scene: Scene) -> tuple[Array, Array]:
+def _away(mapped: Mapped, found: uncertainty.Uncertainty, scene: Scene) -> tuple[Array, Array]:
     """Errors of stations and points; the usual depth weighs turns against positions."""
     depth_m = float(np.median(np.linalg.norm(_observations(mapped).arm, axis=1)))
     true = true_stations(scene, mapped)
@@ -240,12 +231,12 @@ def test_with_random_errors_of_calibration_the_block_is_as_good_as_stated(tmp_pa
         steps = {name: float(s * rng.normal()) for name, s in SIGMAS.items()}
         scene = replace(noisy(seed), rig=off(noisy().rig, steps))
         mapped, _ = points_with(scene.rig, tmp_path, seed)
-        found = estimate(mapped, scene.records, part_of(mapped, scene))
+        found = uncertainty.estimate(mapped, scene.records, part_of(mapped, scene))
         away = _away(mapped, found, noisy())
         stations.append(away[0] / _sigmas(found.frame_cov))
         points.append(away[1] / _sigmas(found.point_cov))
         apart.append(_relative_misses(found, away[1], mapped, rng))
-        without = estimate(mapped, scene.records)
+        without = uncertainty.estimate(mapped, scene.records)
         too_sure.append(away[1] / _sigmas(without.point_cov))
     for ratios in (stations, points, apart):
         assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.4
@@ -256,7 +247,7 @@ def test_points_move_like_those_of_their_own_group() -> None:
     """Where groups lie over each other, the nearest place may be of the other one."""
     rng = np.random.default_rng(7)
     places, of_place = rng.uniform(0, 1, (40, 3)), rng.integers(0, 2, 40)
-    part = Motions(
+    part = uncertainty.Motions(
         stations=np.zeros((2, 6, 1)),
         places=places,
         points=np.where(of_place, 3.0, 1.0)[:, None, None] * np.ones((40, 3, 1)),
@@ -284,7 +275,7 @@ def test_a_station_that_sees_next_to_nothing_stays(tmp_path: Path) -> None:
 
 
 def _relative_misses(
-    found: Uncertainty, misses: Array, mapped: Mapped, rng: np.random.Generator
+    found: uncertainty.Uncertainty, misses: Array, mapped: Mapped, rng: np.random.Generator
 ) -> Array:
     """Errors of one point relative to another over what shared motions and own noise say."""
     shared, places = found.shared, observations(mapped.model).points
@@ -292,7 +283,7 @@ def _relative_misses(
     i, j = rng.permutation(len(rows))[:200].reshape(2, 100)
     motion = shared.motions[i] - shared.motions[j]
     noise = found.point_noise[rows[i]] + found.point_noise[rows[j]]
-    variance = np.diagonal(spread(motion, shared.covariance) + noise, axis1=1, axis2=2)
+    variance = np.diagonal(uncertainty.spread(motion, shared.covariance) + noise, axis1=1, axis2=2)
     ratios: Array = (misses[rows[i]] - misses[rows[j]]) / np.sqrt(variance)
     return ratios
 
@@ -302,13 +293,15 @@ def test_what_points_share_is_nearly_all_that_poses_do(tmp_path: Path) -> None:
     part = part_of(mapped, noisy())
     shares = []
     for calibration in (None, part):
-        found = estimate(mapped, noisy().records, calibration)
-        write_uncertainty(tmp_path / "a.npz", found)
-        shared: Any = read_uncertainty(tmp_path / "a.npz").shared
+        found = uncertainty.estimate(mapped, noisy().records, calibration)
+        uncertainty.write_uncertainty(tmp_path / "a.npz", found)
+        shared: Any = uncertainty.read_uncertainty(tmp_path / "a.npz").shared
         away, rows = KDTree(places).query(shared.places)
         assert np.max(away) == 0.0
         pose = np.trace((found.point_cov - found.point_noise)[rows], axis1=1, axis2=2)
-        share = np.trace(spread(shared.motions, shared.covariance), axis1=1, axis2=2) / pose
+        share = (
+            np.trace(uncertainty.spread(shared.motions, shared.covariance), axis1=1, axis2=2) / pose
+        )
         assert share.max() < 1.1
         shares.append(float(np.median(share)))
     assert 0.6 < shares[0] < 1.001, shares
@@ -321,9 +314,9 @@ def test_parts_of_a_large_survey_know_what_the_whole_knows(
     mapped, _ = points_with(noisy().rig, tmp_path)
     records, part = noisy().records, part_of(mapped, noisy())
     count = mapped.model.compute_num_observations()
-    whole = estimate(mapped, records, part)
+    whole = uncertainty.estimate(mapped, records, part)
     monkeypatch.setattr(exact_observations, "PART", -(-count // 6))
-    parts = estimate(mapped, records, part)
+    parts = uncertainty.estimate(mapped, records, part)
     for found, wanted in (
         (parts.frame_cov, whole.frame_cov),
         (parts.point_cov, whole.point_cov),
@@ -341,7 +334,7 @@ def test_parts_of_a_large_survey_know_what_the_whole_knows(
     for workers in (1, 3):
         with PicklingThreads(workers) as engine:
             given = Workers(executor=engine.executor, folder=tmp_path / f"{workers}")
-            again = estimate(mapped, records, part, workers=given)
+            again = uncertainty.estimate(mapped, records, part, workers=given)
         assert engine.tasks >= 5 * 6
         np.testing.assert_array_equal(again.frame_cov, parts.frame_cov)
         np.testing.assert_array_equal(again.point_cov, parts.point_cov)
@@ -453,6 +446,7 @@ def rms_and_scale(found: Adjusted, scene: Scene) -> tuple[float, float]:
     return rigid_rms(at, true), align_similarity(at, true).scale - 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("jump_m", [0.0, 8.0])
 def test_navigation_straightens_a_long_line_but_leaves_its_scale(
     jump_m: float, tmp_path: Path
@@ -468,6 +462,7 @@ def test_navigation_straightens_a_long_line_but_leaves_its_scale(
     assert scale.max() < 1e-3, "2 % of the log must not reach the model"
 
 
+@pytest.mark.slow
 def test_one_camera_takes_scale_and_shape_from_navigation() -> None:
     """Pictures of the left camera alone, in a unit of 0.37 m: errors are as large as stated."""
     ratios, bends = [], []

@@ -4,12 +4,7 @@ import numpy as np
 from alice_survey.core.artefacts import read_json
 from alice_survey.core.executor import SERIAL
 from reconstruct.dense import cloud as cloud_module
-from reconstruct.dense.cloud import (
-    VERTEX,
-    vertices_of,
-    write_cloud,
-    write_clouds,
-)
+from reconstruct.dense.cloud import VERTEX, vertices_of, write_cloud, write_clouds
 from reconstruct.dense.surface_points import SURFACE_POINT
 from reconstruct.dense.surface_tiles import SurfaceTile
 from reconstruct.dense.view_store import ViewStore

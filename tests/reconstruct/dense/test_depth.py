@@ -4,20 +4,9 @@ import pytest
 
 from reconstruct.dense.depth import match, pair_depth, without_mixed
 from reconstruct.pictures.normalise import normalise
-from tests.oracles_dense import (
-    DEPTH_M,
-    HEIGHT,
-    WIDTH,
-    Scene,
-    flat,
-    hits,
-    render,
-    sloped_with_step,
-    speckle,
-    stereo_views,
-)
+from tests import oracles_dense
 
-EVERYWHERE = np.ones((HEIGHT, WIDTH), bool)
+EVERYWHERE = np.ones((oracles_dense.HEIGHT, oracles_dense.WIDTH), bool)
 
 
 def shifted(shift_px: float, height: int = 120, width: int = 260) -> tuple[np.ndarray, np.ndarray]:
@@ -68,18 +57,20 @@ def test_mixed_pixels_go_on_both_sides_of_a_step_and_slopes_stay():
 
 @pytest.mark.parametrize("heading_deg", [0.0, 130.0])
 def test_depth_of_a_slope_with_a_step(heading_deg: float):
-    scene = Scene(depth_of=sloped_with_step, paint=speckle())
-    views = stereo_views(np.array([0.1, 0.45]), np.array([0.3, 0.4]), heading_deg)
+    scene = oracles_dense.Scene(
+        depth_of=oracles_dense.sloped_with_step, paint=oracles_dense.speckle()
+    )
+    views = oracles_dense.stereo_views(np.array([0.1, 0.45]), np.array([0.3, 0.4]), heading_deg)
     one, other = views[0], views[1]
-    here, there = ((normalise(render(v, scene)), EVERYWHERE) for v in (one, other))
+    here, there = ((normalise(oracles_dense.render(v, scene)), EVERYWHERE) for v in (one, other))
     rng = np.random.default_rng(1)
     place = rng.uniform(-0.3, 0.9, (200, 2))
-    points = np.column_stack([place, sloped_with_step(*place.T)])
+    points = np.column_stack([place, oracles_dense.sloped_with_step(*place.T)])
 
     found = pair_depth((one, other), (here, there), points)
     depth, sigma = found.depth, found.sigma(0.3)
 
-    true = one.world_from_cam.inv().apply(hits(one, scene).reshape(-1, 3))[:, 2]
+    true = one.world_from_cam.inv().apply(oracles_dense.hits(one, scene).reshape(-1, 3))[:, 2]
     error = depth - true.reshape(depth.shape)
     known = np.isfinite(depth)
     assert known.mean() > 0.5
@@ -89,12 +80,14 @@ def test_depth_of_a_slope_with_a_step(heading_deg: float):
 
 
 def test_masked_pixels_get_no_depth():
-    scene = Scene(depth_of=flat, paint=speckle())
-    one, other, *_ = stereo_views(np.array([0.0, 0.35]), np.array([0.0, 0.0]), 0.0)
-    left, right = (normalise(render(v, scene)) for v in (one, other))
+    scene = oracles_dense.Scene(depth_of=oracles_dense.flat, paint=oracles_dense.speckle())
+    one, other, *_ = oracles_dense.stereo_views(np.array([0.0, 0.35]), np.array([0.0, 0.0]), 0.0)
+    left, right = (normalise(oracles_dense.render(v, scene)) for v in (one, other))
     masked = EVERYWHERE.copy()
     masked[:, :200] = False
-    points = np.array([[0.1, 0.1, DEPTH_M + 0.05], [0.0, 0.2, DEPTH_M - 0.05]] * 3)
+    points = np.array(
+        [[0.1, 0.1, oracles_dense.DEPTH_M + 0.05], [0.0, 0.2, oracles_dense.DEPTH_M - 0.05]] * 3
+    )
     here, there, free = (
         pair_depth((one, other), ((left, seen), (right, matched)), points).depth
         for seen, matched in ((masked, EVERYWHERE), (EVERYWHERE, masked), (EVERYWHERE, EVERYWHERE))

@@ -8,10 +8,7 @@ from alice_survey.core.block_solver import MAD_TO_SIGMA
 from alice_survey.core.executor import SERIAL
 from alice_survey.core.frames import Array
 from reconstruct.dense.depth import enlarge
-from reconstruct.dense.matching_trial import (
-    find_scales,
-    scale_for_cell,
-)
+from reconstruct.dense.matching_trial import find_scales, scale_for_cell
 from reconstruct.dense.stereo_pairs import choose_partners
 from reconstruct.dense.view_store import ViewStore
 from reconstruct.dense.views import (
@@ -23,13 +20,7 @@ from reconstruct.dense.views import (
 )
 from reconstruct.mosaic.grid import mean_pixel
 from reconstruct.views.model import points_of_views, scaled_view
-from tests.oracles_dense import (
-    block_scene,
-    hits,
-    sparse_model,
-    stereo_views,
-    write_workspace,
-)
+from tests.oracles_dense import block_scene, hits, sparse_model, stereo_views, write_workspace
 
 SCENE = block_scene()
 

@@ -9,35 +9,16 @@ import pytest
 from alice_survey.app.stages import spec
 from alice_survey.core.config import SurveyConfig
 from alice_survey.core.executor import SERIAL
-from reconstruct.dense.moving import (
-    Look,
-    cells_at,
-    draw,
-    find_odd,
-    shared_depth,
-    smooth_difference,
-    smooth_features,
-    with_bounds,
-)
+from reconstruct.dense import moving
 from reconstruct.pictures.undistorted import Pictures
 from reconstruct.views.model import View
-from tests.oracles_dense import (
-    ALTITUDE_M,
-    DEPTH_M,
-    HEIGHT,
-    WIDTH,
-    block_scene,
-    plane_depth,
-    port_view,
-    two_lines,
-    write_workspace,
-)
+from tests import oracles_dense
 
-SCENE = block_scene()
+SCENE = oracles_dense.block_scene()
 SEMI_AXES_M = (0.14, 0.06)
 
 
-VIEWS = two_lines(-0.05, 0.2, 0.45, 0.7)
+VIEWS = oracles_dense.two_lines(-0.05, 0.2, 0.45, 0.7)
 
 
 def body_mask(view: View, middle: np.ndarray) -> np.ndarray:
@@ -45,20 +26,28 @@ def body_mask(view: View, middle: np.ndarray) -> np.ndarray:
     turn = np.linspace(0, 2 * np.pi, 90)
     rim = np.column_stack([SEMI_AXES_M[0] * np.cos(turn), SEMI_AXES_M[1] * np.sin(turn), 0 * turn])
     at = view.project(middle + rim)
-    drawn = np.zeros((HEIGHT, WIDTH), np.uint8)
+    drawn = np.zeros((oracles_dense.HEIGHT, oracles_dense.WIDTH), np.uint8)
     cv2.fillPoly(drawn, [np.rint(at - 0.5).astype(np.int32)], 1)
     return drawn > 0
 
 
 def place_of(station: int) -> np.ndarray:
     """Where the body is at a station's time: it crosses the survey, 0.4 m above the floor."""
-    return np.array([0.1 + 0.08 * station, -0.1 + 0.12 * station, DEPTH_M - 0.2 * ALTITUDE_M])
+    return np.array(
+        [
+            0.1 + 0.08 * station,
+            -0.1 + 0.12 * station,
+            oracles_dense.DEPTH_M - 0.2 * oracles_dense.ALTITUDE_M,
+        ]
+    )
 
 
 def with_light(folder: Path, views: list[View], bodies: bool) -> dict[str, np.ndarray]:
     """Draw bodies, a lamp's pattern and noise into the pictures; where the bodies are."""
     rng = np.random.default_rng(4)
-    x, y = np.meshgrid(np.linspace(-1, 1, WIDTH), np.linspace(-1, 1, HEIGHT))
+    x, y = np.meshgrid(
+        np.linspace(-1, 1, oracles_dense.WIDTH), np.linspace(-1, 1, oracles_dense.HEIGHT)
+    )
     lamp = np.exp(-0.35 * (x - 0.2) ** 2 - 0.25 * y**2)
     found = {}
     for view in views:
@@ -75,7 +64,7 @@ def with_light(folder: Path, views: list[View], bodies: bool) -> dict[str, np.nd
 
 
 def made(folder: Path, bodies: bool) -> dict[str, np.ndarray]:
-    write_workspace(folder, VIEWS, SCENE)
+    oracles_dense.write_workspace(folder, VIEWS, SCENE)
     truth = with_light(folder, VIEWS, bodies)
     assert spec("dense").make(folder, SurveyConfig(), SERIAL)
     return truth
@@ -85,7 +74,7 @@ def masks(folder: Path) -> dict[str, np.ndarray]:
     """What is left out of each picture."""
     still = Pictures.still(folder)
     usable = {view.image: still.usable(view.image) for view in VIEWS}
-    nothing = np.ones((HEIGHT, WIDTH), bool)
+    nothing = np.ones((oracles_dense.HEIGHT, oracles_dense.WIDTH), bool)
     return {name: ~(nothing if mask is None else mask) for name, mask in usable.items()}
 
 
@@ -95,6 +84,7 @@ def crossed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, n
     return folder, made(folder, True)
 
 
+@pytest.mark.slow
 def test_a_body_that_crosses_is_masked(crossed: tuple[Path, dict[str, np.ndarray]]):
     folder, truth = crossed
     found = masks(folder)
@@ -119,6 +109,7 @@ def still(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_still_survey_keeps_its_pictures_whole(still: Path):
     found = masks(still)
     assert np.mean([mask.mean() for mask in found.values()]) < 5e-4
@@ -128,9 +119,9 @@ def test_a_still_survey_keeps_its_pictures_whole(still: Path):
 def test_the_nearest_depth_that_two_stations_share():
     nan = np.nan
     stack = np.array([[1.0, 1.0, 2.0, nan], [1.01, 1.01, 2.02, 3.0], [1.5, 0.5, 2.5, nan]])
-    found = shared_depth(stack[:, None].astype(np.float32), np.array([0, 0, 1]), 0.02)
+    found = moving.shared_depth(stack[:, None].astype(np.float32), np.array([0, 0, 1]), 0.02)
     assert np.isnan(found).all()  # the first two share a station
-    found = shared_depth(stack[:, None].astype(np.float32), np.array([0, 1, 1]), 0.02)[0]
+    found = moving.shared_depth(stack[:, None].astype(np.float32), np.array([0, 1, 1]), 0.02)[0]
     np.testing.assert_allclose(found[:3], [1.005, 1.005, 2.01], rtol=1e-6)
     assert np.isnan(found[3])
 
@@ -151,23 +142,26 @@ def drawn(depth: np.ndarray, one: View, other: View, step: float) -> np.ndarray:
 
 def port_views() -> tuple[View, View, np.ndarray, int]:
     """Two views through a tilted port, the depth of the first on a lattice, and its step."""
-    one, other = port_view([0, 0, 0], [1.0, -2.0, 30.0]), port_view([0.2, 0.1, 0], [-1, 1, 28])
+    one, other = (
+        oracles_dense.port_view([0, 0, 0], [1.0, -2.0, 30.0]),
+        oracles_dense.port_view([0.2, 0.1, 0], [-1, 1, 28]),
+    )
     step = 4
-    depth = np.ascontiguousarray(plane_depth(one, 1.2)[2::step, 2::step])
+    depth = np.ascontiguousarray(oracles_dense.plane_depth(one, 1.2)[2::step, 2::step])
     rng = np.random.default_rng(2)
     depth *= rng.uniform(0.97, 1.03, depth.shape).astype(np.float32)
     depth[:3] = np.nan
     return one, other, depth, step
 
 
-def look_of(view: View, depth: np.ndarray, step: int) -> Look:
+def look_of(view: View, depth: np.ndarray, step: int) -> moving.Look:
     light, usable = np.zeros((*depth.shape, 3, 3), np.float32), np.ones(depth.shape, bool)
-    return Look(view=view, step=step, light=light, usable=usable, depth=depth)
+    return moving.Look(view=view, step=step, light=light, usable=usable, depth=depth)
 
 
 def test_a_surface_is_drawn_into_another_view_as_its_slow_twin_does():
     one, other, depth, step = port_views()
-    found = draw(look_of(one, depth, step), look_of(other, depth, step))
+    found = moving.draw(look_of(one, depth, step), look_of(other, depth, step))
     expected = drawn(depth, one, other, step)
     assert 0.3 < np.isfinite(expected).mean() < 1.0
     alike = np.isclose(found, expected, rtol=1e-5, equal_nan=True)
@@ -184,7 +178,9 @@ def test_cells_show_points_that_lie_at_their_depth():
     z = rng.uniform(1.1, 1.3, len(pixels))
     points = one.at_depth(pixels, z)
     here = (1.5 + 0.001 * np.arange(len(points))).astype(np.float32)
-    cells, log_ratio = cells_at(points, here, look_of(one, depth, step)._replace(usable=usable))
+    cells, log_ratio = moving.cells_at(
+        points, here, look_of(one, depth, step)._replace(usable=usable)
+    )
 
     columns, rows = np.floor(pixels / step).astype(int).T
     inside = (columns >= 0) & (rows >= 0) & (columns < depth.shape[1]) & (rows < depth.shape[0])
@@ -198,7 +194,7 @@ def test_cells_show_points_that_lie_at_their_depth():
 
 
 def test_bounds_of_light_are_those_of_the_cells_around():
-    light = with_bounds(np.random.default_rng(2).normal(size=(9, 11, 3)).astype(np.float32))
+    light = moving.with_bounds(np.random.default_rng(2).normal(size=(9, 11, 3)).astype(np.float32))
     np.testing.assert_array_equal(light[4, 5, 1], light[3:6, 4:7, 0].min(axis=(0, 1)))
     np.testing.assert_array_equal(light[4, 5, 2], light[3:6, 4:7, 0].max(axis=(0, 1)))
 
@@ -211,8 +207,8 @@ def test_smooth_differences_of_light_are_found_under_what_moves():
     true = np.stack([x**0, x, y, x * x, x * y, y * y, log_ratio], axis=1) @ fit
     apart = true + rng.normal(0, 0.03, true.shape)
     apart[:300] += 1.5
-    features = smooth_features(places, log_ratio)
-    found, sigma = smooth_difference(features, apart.astype(np.float32))
+    features = moving.smooth_features(places, log_ratio)
+    found, sigma = moving.smooth_difference(features, apart.astype(np.float32))
     assert 1e-3 < np.sqrt(np.mean((features @ found - true) ** 2)) < 0.04  # without weights 0.15
     assert ((sigma > 0.03) & (sigma < 0.06)).all()  # of noise, and what the ridge leaves
 
@@ -227,8 +223,8 @@ def test_a_cell_is_odd_where_others_agree_on_something_else():
     levels = ((0.0, 0.0, 0.0, 0.0), (0.02, 0.02, 0.02, 2.0), (0.01, 0.01, 0.01, 4.0))
     shown = np.array([[light(v) for v in row] for row in levels])
     sigma = np.full(3, 0.1, np.float32)
-    misfit, votes = find_odd(own, shown, np.array([0, 1, 2]), sigma, 2.0)
+    misfit, votes = moving.find_odd(own, shown, np.array([0, 1, 2]), sigma, 2.0)
     np.testing.assert_allclose(misfit[:3], [0.0, (1.0 - 0.11) / 0.1, 0.0], atol=1e-4)
     assert votes[:3].tolist() == [3, 3, 3]
     assert votes[3] == 0  # they do not agree with each other
-    assert find_odd(own, shown, np.array([0, 0, 0]), sigma, 2.0)[1].max() == 1
+    assert moving.find_odd(own, shown, np.array([0, 0, 0]), sigma, 2.0)[1].max() == 1

@@ -21,6 +21,7 @@ from tests.oracles_dense import (
     write_workspace,
 )
 
+pytestmark = pytest.mark.slow
 SCENE = block_scene()
 WORLD_FROM_SCENE = RigidTransform.from_components(
     [30.0, -4.0, 6.0], Rotation.from_matrix([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])

@@ -4,36 +4,22 @@ import cv2
 import numpy as np
 import pytest
 
-from reconstruct.dense.points import (
-    block_bounds,
-    part_in_box,
-    points_in_box,
-    points_of_pixels,
-)
+from reconstruct.dense.points import block_bounds, part_in_box, points_in_box, points_of_pixels
 from reconstruct.dense.view_store import ViewStore
 from reconstruct.pictures.undistorted import WHOLE
 from reconstruct.views.range_shift import no_shift
-from tests.oracles_dense import (
-    Scene,
-    hits,
-    pixels_of,
-    plane_depth,
-    port_view,
-    position_code,
-    stereo_views,
-)
+from tests import oracles_dense
 
 EVERYWHERE = (-100.0, 100.0, -100.0, 100.0)
-SCENE = Scene(
-    depth_of=lambda n, e: 12.0 + 0.2 * n - 0.1 * e + 0.0 * n * e,
-    paint=position_code,
+SCENE = oracles_dense.Scene(
+    depth_of=lambda n, e: 12.0 + 0.2 * n - 0.1 * e + 0.0 * n * e, paint=oracles_dense.position_code
 )
 OFFSET = np.array([3.0, -2.0, -12.0])
-VIEW = stereo_views(np.array([0.2]), np.array([0.1]))[0]
+VIEW = oracles_dense.stereo_views(np.array([0.2]), np.array([0.1]))[0]
 
 
 def depth_of(view) -> np.ndarray:
-    cam = view.world_from_cam.inv().apply(hits(view, SCENE).reshape(-1, 3))
+    cam = view.world_from_cam.inv().apply(oracles_dense.hits(view, SCENE).reshape(-1, 3))
     return cam[:, 2].reshape(view.pinhole.size_px[::-1]).astype(np.float32)
 
 
@@ -50,7 +36,7 @@ def gathered(view, box=EVERYWHERE, factors=None, depth=None):
 
 def test_points_lie_where_the_rays_hit():
     points = gathered(VIEW)
-    world = hits(VIEW, SCENE).reshape(-1, 3)
+    world = oracles_dense.hits(VIEW, SCENE).reshape(-1, 3)
     enu = np.column_stack([world[:, 1], world[:, 0], -world[:, 2]]) - OFFSET
     np.testing.assert_allclose(points.enu, enu, atol=2e-6)
     assert (points.views == 7).all()
@@ -95,19 +81,19 @@ def test_colours_take_the_factors_of_their_place():
 
 
 def test_points_through_a_tilted_port_lie_where_the_exact_rays_hit():
-    view = port_view([0.2, -0.1, 0.0], [2.0, -1.0, 40.0])
-    depth = plane_depth(view, 1.6)  # far from the range at which the picture is exact
+    view = oracles_dense.port_view([0.2, -0.1, 0.0], [2.0, -1.0, 40.0])
+    depth = oracles_dense.plane_depth(view, 1.6)  # far from the range at which the picture is exact
     points = gathered(view, depth=depth).enu + OFFSET
     np.testing.assert_allclose(points[:, 2], -1.6, atol=1e-6)
     back = view.project(points[:, [1, 0, 2]] * [1, 1, -1])
-    np.testing.assert_allclose(back, pixels_of(view), atol=2e-3)
+    np.testing.assert_allclose(back, oracles_dense.pixels_of(view), atol=2e-3)
     bare = gathered(replace(view, shift=no_shift(*view.pinhole.size_px)), depth=depth).enu + OFFSET
     assert 5e-4 < np.abs(bare - points).max() < 0.05
 
 
 def test_the_part_of_a_view_that_meets_a_box_gives_what_the_whole_view_gives(tmp_path):
     """From a store, for a view through a port, whose pixels show other places at other depths."""
-    view = port_view([0.2, 0.1, 10.0], [2.0, -3.0, 40.0])
+    view = oracles_dense.port_view([0.2, 0.1, 10.0], [2.0, -3.0, 40.0])
     depth = depth_of(view)
     rng = np.random.default_rng(4)
     colour = cv2.GaussianBlur(rng.integers(0, 255, (*depth.shape, 3), np.uint8), (0, 0), 2.0)

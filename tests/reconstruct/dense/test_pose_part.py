@@ -4,10 +4,7 @@ import numpy as np
 import pytest
 
 from reconstruct.adjustment.uncertainty import Uncertainty, no_modes, write_uncertainty
-from reconstruct.dense.surface_tiles import (
-    ErrorsOfPoses,
-    find_errors_of_poses,
-)
+from reconstruct.dense.surface_tiles import ErrorsOfPoses, find_errors_of_poses
 from reconstruct.views.model import read_model
 from tests.oracles_dense import CODED, stereo_views, write_workspace
 

@@ -18,8 +18,7 @@ from reconstruct.dense.stereo_pairs import in_frame
 from tests.oracles_dense import Scene, hits, pixels_of, render, speckle, stereo_views
 
 SCENE = Scene(
-    depth_of=lambda n, e: 12.0 + 0.06 * np.sin(6 * n) * np.cos(5 * e) + 0.1 * n,
-    paint=speckle(),
+    depth_of=lambda n, e: 12.0 + 0.06 * np.sin(6 * n) * np.cos(5 * e) + 0.1 * n, paint=speckle()
 )
 VIEWS = stereo_views(np.array([0.1, 0.45]), np.array([0.3, 0.4]))
 FAR_VIEWS = stereo_views(np.array([0.1, 0.9]), np.array([0.3, 0.4]))

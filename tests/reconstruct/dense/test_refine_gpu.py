@@ -105,6 +105,7 @@ def simulated(folder: Path, case: tuple[Any, ...], before: str = "", **environme
         return pickle.load(file), done.stderr  # noqa: S301 (its own)
 
 
+@pytest.mark.slow
 def test_a_gpu_gives_what_the_processor_gives(tmp_path: Path, case: tuple[Any, ...]) -> None:
     found, said = simulated(tmp_path, case, FEW_THREADS, NUMBA_DISABLE_JIT="1")
 

@@ -12,34 +12,25 @@ from alice_survey.core.executor import SERIAL, local_executor
 from alice_survey.core.products import rasters_in
 from reconstruct.dense import run
 from reconstruct.dense.stereo_pairs import in_frame
-from tests.oracles_dense import (
-    Scene,
-    block_scene,
-    flat,
-    read_raster,
-    sloped_with_step,
-    stereo_views,
-    two_lines,
-    write_workspace,
-)
+from tests import oracles_dense
 
-SCENE = block_scene()
+SCENE = oracles_dense.block_scene()
 CONFIG = SurveyConfig(reconstruct=ReconstructConfig())
 
 
-VIEWS = two_lines(-0.05, 0.3, 0.65)
+VIEWS = oracles_dense.two_lines(-0.05, 0.3, 0.65)
 
 
 @pytest.fixture(scope="module")
 def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("survey")
-    write_workspace(folder, VIEWS, SCENE)
+    oracles_dense.write_workspace(folder, VIEWS, SCENE)
     assert spec("dense").make(folder, CONFIG, SERIAL)
     return folder
 
 
 def bands(workspace: Path, *names: str) -> list[np.ndarray]:
-    return [read_raster(workspace / "dense" / f"{name}.tif")[0] for name in names]
+    return [oracles_dense.read_raster(workspace / "dense" / f"{name}.tif")[0] for name in names]
 
 
 def middle(north: np.ndarray, east: np.ndarray) -> np.ndarray:
@@ -48,10 +39,10 @@ def middle(north: np.ndarray, east: np.ndarray) -> np.ndarray:
 
 
 def test_surface_agrees_with_the_truth_edges_included(workspace: Path):
-    height, north, east = read_raster(workspace / "dense" / "dem.tif")
+    height, north, east = oracles_dense.read_raster(workspace / "dense" / "dem.tif")
     here = middle(north, east)
     assert np.isfinite(height[here]).mean() > 0.97
-    error = (height + sloped_with_step(north, east))[here]
+    error = (height + oracles_dense.sloped_with_step(north, east))[here]
     error = error[np.isfinite(error)]
     assert 3e-5 < np.median(np.abs(error)) < 3e-4  # matching alone gives 4e-4; a pixel is 4.7 mm
     assert abs(np.median(error)) < 8e-4
@@ -61,10 +52,10 @@ def test_surface_agrees_with_the_truth_edges_included(workspace: Path):
 
 
 def test_sigma_is_an_honest_bound(workspace: Path):
-    height, north, east = read_raster(workspace / "dense" / "dem.tif")
+    height, north, east = oracles_dense.read_raster(workspace / "dense" / "dem.tif")
     sigma, count = bands(workspace, "sigma", "count")
     flat_part = middle(north, east) & (np.abs(north - 0.3) > 0.25) & (count > 0)
-    error = (height + sloped_with_step(north, east))[flat_part]
+    error = (height + oracles_dense.sloped_with_step(north, east))[flat_part]
     ratio = np.sqrt(np.mean(np.clip(error / sigma[flat_part], -5, 5) ** 2))
     assert 0.15 < ratio < 1.2
     np.testing.assert_array_equal(np.isfinite(height), np.isfinite(sigma))
@@ -79,7 +70,7 @@ def test_cloud_lies_on_the_surface_with_normals_up(workspace: Path):
     cloud = o3d.t.io.read_point_cloud(str(workspace / "dense" / "cloud.ply"))
     enu = cloud.point.positions.numpy() + np.array(about["offset_east_north_up"])
     assert len(enu) == about["points"] > 20_000
-    error = enu[:, 2] + sloped_with_step(enu[:, 1], enu[:, 0])
+    error = enu[:, 2] + oracles_dense.sloped_with_step(enu[:, 1], enu[:, 0])
     assert np.median(np.abs(error)) < 0.003
     normals = cloud.point.normals.numpy()
     level = np.abs(enu[:, 1] - 0.3) > 0.3
@@ -89,7 +80,7 @@ def test_cloud_lies_on_the_surface_with_normals_up(workspace: Path):
 
 
 def test_stations_and_slope(workspace: Path):
-    _, north, east = read_raster(workspace / "dense" / "dem.tif")
+    _, north, east = oracles_dense.read_raster(workspace / "dense" / "dem.tif")
     count, stations, slope = bands(workspace, "count", "stations", "slope")
     assert (stations <= count).all()
     assert (2 * stations >= count).all()  # a station has two cameras
@@ -110,10 +101,11 @@ def test_scratch_is_gone_and_files_are_there(workspace: Path):
     assert names == rasters | styles | clouds | others
 
 
+@pytest.mark.slow
 def test_an_interruption_while_a_plane_is_written_costs_nothing(
     workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    write_workspace(tmp_path, VIEWS, SCENE)
+    oracles_dense.write_workspace(tmp_path, VIEWS, SCENE)
     with monkeypatch.context() as interrupted:
 
         def stop(dem: Path, picture: Path) -> None:
@@ -131,18 +123,20 @@ def test_an_interruption_while_a_plane_is_written_costs_nothing(
 
 
 def test_pictures_without_texture_are_refused(tmp_path: Path):
-    grey = Scene(depth_of=flat, paint=lambda n, e: np.full((*n.shape, 3), 90.0))
-    views = stereo_views(np.array([0.0, 0.3]), np.array([0.0, 0.0]))
-    write_workspace(tmp_path, views, grey)
+    grey = oracles_dense.Scene(
+        depth_of=oracles_dense.flat, paint=lambda n, e: np.full((*n.shape, 3), 90.0)
+    )
+    views = oracles_dense.stereo_views(np.array([0.0, 0.3]), np.array([0.0, 0.0]))
+    oracles_dense.write_workspace(tmp_path, views, grey)
     with pytest.raises(ReconstructionError):
         spec("dense").make(tmp_path, CONFIG, SERIAL)
     assert not (tmp_path / "dense").exists()
 
 
 def test_what_one_stereo_pair_alone_sees_is_kept_with_an_honest_sigma(workspace: Path):
-    height, north, east = read_raster(workspace / "dense" / "dem.tif")
+    height, north, east = oracles_dense.read_raster(workspace / "dense" / "dem.tif")
     (sigma,) = bands(workspace, "sigma")
-    true = sloped_with_step(north, east)
+    true = oracles_dense.sloped_with_step(north, east)
     ground = np.stack([north.ravel(), east.ravel(), true.ravel()], axis=1)
     left, right = np.split(np.array([in_frame(view, ground) for view in VIEWS]), 2)
     alone = ((left & right).sum(axis=0) == 1) & (left.sum(axis=0) + right.sum(axis=0) == 2)

@@ -23,6 +23,8 @@ from reconstruct.export import bilinear, destination, export_projected, export_u
 from reconstruct.pictures.undistorted import Pictures
 from reconstruct.views.model import View, read_frame, read_model, read_warps
 
+pytestmark = pytest.mark.slow
+
 CRS = "EPSG:32636"
 CENTRAL_DEG, EAST_M, SCALE = 33.0, 500_000.0, 0.9996
 

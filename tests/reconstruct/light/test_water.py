@@ -48,7 +48,7 @@ def survey(
     return samples, {"left": dark, "right": dark}
 
 
-@pytest.mark.parametrize("spread", [0.0, 2.0])
+@pytest.mark.parametrize("spread", [0.0, pytest.param(2.0, marks=pytest.mark.slow)])
 def test_water_is_found_under_a_lamp_and_in_daylight(spread: float) -> None:
     samples, dark = survey(1.2, 3.0, spread=spread)
     found = solve_water(samples, dark, CAMERAS)
@@ -63,6 +63,7 @@ def test_water_is_found_under_a_lamp_and_in_daylight(spread: float) -> None:
         assert np.abs(dark[name] / veil(NODE_X, NODE_Y) - 1.0).mean() > 0.3
 
 
+@pytest.mark.slow
 def test_errors_of_fall_off_are_as_large_as_stated() -> None:
     samples, dark = survey(1.5, 2.6)
     found = solve_water(samples, dark, CAMERAS)
@@ -72,6 +73,7 @@ def test_errors_of_fall_off_are_as_large_as_stated() -> None:
     assert (found.to_green_sigma < 0.1).all()
 
 
+@pytest.mark.slow
 def test_growth_with_range_matters_where_ranges_differ_much() -> None:
     samples, dark = survey(0.5, 4.0)
     found = solve_water(samples, dark, CAMERAS)

@@ -121,10 +121,17 @@ def test_the_rig_is_held_constant_and_the_cameras_too() -> None:
         assert (focal, cx, cy) == (expected.focal_px, expected.cx_px, expected.cy_px)
 
 
-PAIR = ("left", "right")
+PAIR, SLOW = ("left", "right"), pytest.mark.slow
 
 
-@pytest.mark.parametrize(("names", "exif"), [(PAIR, ()), (PAIR, PAIR), ((*PAIR, "top"), ())])
+@pytest.mark.parametrize(
+    ("names", "exif"),
+    [
+        (PAIR, ()),
+        pytest.param(PAIR, PAIR, marks=SLOW),
+        pytest.param((*PAIR, "top"), (), marks=SLOW),
+    ],
+)
 def test_self_calibration_finds_focal_length_distortion_and_rig(
     names: tuple[str, ...], exif: tuple[str, ...]
 ) -> None:

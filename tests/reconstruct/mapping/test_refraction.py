@@ -85,7 +85,10 @@ def test_without_noise_nothing_is_left_of_a_dome(
     assert record.contraction == pytest.approx(contraction, rel=0.2)
 
 
-@pytest.mark.parametrize(("port_m", "tilt_deg"), PORTS)
+@pytest.mark.parametrize(
+    ("port_m", "tilt_deg"),
+    [PORTS[0], *(pytest.param(*p, marks=pytest.mark.slow) for p in PORTS[1:])],
+)
 def test_with_noise_points_are_those_of_an_exact_refractive_adjustment(
     port_m: float, tilt_deg: float, tmp_path: Path
 ) -> None:

@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pycolmap
+import pytest
 from scipy.spatial.transform import RigidTransform
 
 from reconstruct.mapping.global_mapper import adjust
@@ -39,6 +40,7 @@ def furthest_m(mapped: Mapped, other: Mapped, scene: Scene) -> float:
     return float(np.linalg.norm(align_rigid(found, wanted).apply(found) - wanted, axis=1).max())
 
 
+@pytest.mark.slow
 def test_more_than_a_thousand_pictures_end_at_the_optimum() -> None:
     """COLMAP's iterative solver leaves tens of millimetres of bend and reports convergence.
 

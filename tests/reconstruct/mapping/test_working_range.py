@@ -8,10 +8,7 @@ import pytest
 from alice_survey.core.errors import ReconstructionError
 from alice_survey.core.executor import SERIAL
 from camera_calib.rig import Rig
-from reconstruct.mapping.working_range import (
-    find_distances,
-    ray_passes,
-)
+from reconstruct.mapping.working_range import find_distances, ray_passes
 from reconstruct.matching.features import Features, save_features
 from tests.reconstruct.rig_survey import four_cameras
 from tests.reconstruct.scenes import ALTITUDE_M, Scene, make_scene

@@ -14,19 +14,8 @@ import pytest
 
 from alice_survey.core.executor import SERIAL
 from alice_survey.core.manifest import ImageRecord
+from reconstruct.matching import learned
 from reconstruct.matching.features import find_features, load_features, save_features
-from reconstruct.matching.learned import (
-    RATIO,
-    Taken,
-    all_pixels,
-    dense_features,
-    false_alarms,
-    find_learned,
-    match_learned,
-    quarter_turns,
-    sample,
-    with_learned,
-)
 from reconstruct.matching.matches import PairTask, apply_homography, match_pair
 from reconstruct.pictures.normalise import normalise
 from tests.oracles_matching import false_alarms_slowly, sampled_slowly
@@ -44,9 +33,9 @@ def reference() -> dict[str, np.ndarray]:
 
 def test_the_network_gives_what_the_original_gives(reference: dict[str, np.ndarray]) -> None:
     """Weights are halves, and we sample bilinearly where the original does bicubically."""
-    descriptors, likely, reliable = dense_features(reference["picture"])
+    descriptors, likely, reliable = learned.dense_features(reference["picture"])
     at = reference["keypoints"].astype(int)
-    found = sample(descriptors, (at + 0.5) / 8 - 0.5)
+    found = learned.sample(descriptors, (at + 0.5) / 8 - 0.5)
     found /= np.linalg.norm(found, axis=1, keepdims=True)
     alike = (found * reference["descriptors"].astype(np.float64)).sum(axis=1)
     scores = (likely * reliable)[at[:, 1], at[:, 0]]
@@ -66,17 +55,17 @@ def test_sampling_equals_its_slow_twin() -> None:
     rng = np.random.default_rng(3)
     field = rng.normal(size=(6, 9, 4)).astype(np.float32)
     at = np.concatenate([rng.uniform(-1, 9, (50, 2)), [[0, 0], [8, 5], [7.999, 4.999]]])
-    np.testing.assert_allclose(sample(field, at), sampled_slowly(field, at), atol=1e-6)
+    np.testing.assert_allclose(learned.sample(field, at), sampled_slowly(field, at), atol=1e-6)
 
 
 def test_false_alarms_equal_exact_counts() -> None:
     """Seventeen of 44 random matches were seen to agree; forty never do."""
     for counts in ((8, 8), (17, 44), (40, 44), (60, 900)):
         exact = false_alarms_slowly(*counts, SIZE)
-        assert false_alarms(*counts, SIZE) == pytest.approx(exact, rel=1e-9)
-    assert false_alarms(7, 44, SIZE) == math.inf
-    assert 1.0 < false_alarms(17, 44, SIZE) < 1e5
-    assert false_alarms(40, 44, SIZE) < 1e-20
+        assert learned.false_alarms(*counts, SIZE) == pytest.approx(exact, rel=1e-9)
+    assert learned.false_alarms(7, 44, SIZE) == math.inf
+    assert 1.0 < learned.false_alarms(17, 44, SIZE) < 1e5
+    assert learned.false_alarms(40, 44, SIZE) < 1e-20
 
 
 def floor(seed: int, blobs: float) -> np.ndarray:
@@ -98,14 +87,14 @@ FIRST = np.array([[1.0, 0, -60], [0, 1, -50], [0, 0, 1]])
 SECOND = np.array([[0.97, 0.08, -120], [-0.08, 0.97, -40], [4e-5, -3e-5, 1]])
 
 
-def taken(folder: Path, pictures: list[np.ndarray]) -> list[Taken]:
+def taken(folder: Path, pictures: list[np.ndarray]) -> list[learned.Taken]:
     """Pictures with their SIFT features, as the mapping keeps them."""
     found = []
     for i, picture in enumerate(pictures):
         path, sift = folder / f"{i}.png", folder / f"{i}.npz"
         cv2.imwrite(str(path), picture)
         save_features(sift, find_features(normalise(picture), None, maximum=3000))
-        found.append(Taken(picture=path, mask=None, features=sift, maximum=3000, turns=0))
+        found.append(learned.Taken(picture=path, mask=None, features=sift, maximum=3000, turns=0))
     return found
 
 
@@ -123,19 +112,19 @@ def test_a_pair_that_sift_cannot_tie_is_tied_rightly_and_a_strange_one_is_not(
     tasks = [task(rows[i].features, rows[j].features, 0.8) for i, j in ((0, 1), (0, 2), (1, 2))]
     by_sift = [match_pair(one) for one in tasks]
     assert [pair.geometry for pair in by_sift] == [None] * 3
-    pairs = with_learned(rows, tasks, by_sift, SERIAL)
+    pairs = learned.with_learned(rows, tasks, by_sift, SERIAL)
 
     assert [pair.geometry is not None for pair in pairs] == [True, False, False]
     matches = pairs[0].matches
     sift = [len(load_features(row.features).pixels) for row in rows]
     assert all((matches[:, k] >= sift[k]).all() for k in range(2))  # learned ones come after
-    pixels = all_pixels([row.features for row in rows])
+    pixels = learned.all_pixels([row.features for row in rows])
     first, second = (pixels[k][matches[:, k]] for k in range(2))
     expected = apply_homography(SECOND @ np.linalg.inv(FIRST), first - 0.5) + 0.5
     miss = np.linalg.norm(expected - second, axis=1)
     assert 20 <= len(matches) <= 400
     assert 0.3 < np.median(miss) < 3.0
-    again = with_learned(rows, tasks, by_sift, SERIAL)[0]
+    again = learned.with_learned(rows, tasks, by_sift, SERIAL)[0]
     np.testing.assert_array_equal(again.matches, matches)
 
 
@@ -145,9 +134,9 @@ def test_what_moves_with_the_camera_ties_nothing(tmp_path: Path) -> None:
     for k in range(2):
         noise = np.random.default_rng(k).normal(size=pattern.shape)
         grey = np.clip(110 + 20 * pattern + 5 * noise, 0, 255).astype(np.uint8)
-        save_features(tmp_path / f"{k}.npz", find_learned(grey, None, maximum=800))
-    both = task(tmp_path / "0.npz", tmp_path / "1.npz", RATIO)
-    assert match_pair(both).geometry is not None and match_learned(both).geometry is None
+        save_features(tmp_path / f"{k}.npz", learned.find_learned(grey, None, maximum=800))
+    both = task(tmp_path / "0.npz", tmp_path / "1.npz", learned.RATIO)
+    assert match_pair(both).geometry is not None and learned.match_learned(both).geometry is None
 
 
 @pytest.mark.parametrize("turns", [1, 2, 3])
@@ -158,8 +147,12 @@ def test_a_turned_picture_is_tied_once_it_is_turned_back(tmp_path: Path, turns: 
     counts = []
     for back in (0, turns):
         for k, (picture, by) in enumerate(((clear, 0), (turned, back))):
-            save_features(tmp_path / f"{k}.npz", find_learned(picture, None, maximum=800, turns=by))
-        found = match_learned(task(tmp_path / "0.npz", tmp_path / "1.npz", RATIO)).matches
+            save_features(
+                tmp_path / f"{k}.npz", learned.find_learned(picture, None, maximum=800, turns=by)
+            )
+        found = learned.match_learned(
+            task(tmp_path / "0.npz", tmp_path / "1.npz", learned.RATIO)
+        ).matches
         counts.append(len(found))
     assert counts[1] >= 300 and counts[0] < counts[1] / 4
     first, second = (load_features(tmp_path / f"{k}.npz").pixels[found[:, k]] for k in range(2))
@@ -172,5 +165,7 @@ def test_a_turned_picture_is_tied_once_it_is_turned_back(tmp_path: Path, turns: 
 def test_turns_bring_north_up(heading: float, turns: int) -> None:
     record = ImageRecord(image="a.png", camera="left", station=0)
     known = replace(record, roll_deg=1.0, pitch_deg=-2.0, heading_deg=float(heading))
-    found = [quarter_turns(one, None) for one in (known, record, replace(known, pitch_deg=80.0))]
+    found = [
+        learned.quarter_turns(one, None) for one in (known, record, replace(known, pitch_deg=80.0))
+    ]
     assert found == [turns, 0, 0]

@@ -181,6 +181,7 @@ def test_pictures_that_see_the_horizon_are_paired_by_order_and_looks(off_nadir_d
     assert len(placed_pictures(scene.records, scene.rig, DATUM)) == len(scene.records)
 
 
+@pytest.mark.slow
 def test_partners_of_a_picture_grow_neither_with_the_survey_nor_with_visits() -> None:
     scene = make_scene(points=1)
 

@@ -121,12 +121,14 @@ def test_noise_makes_no_floor_rougher(tmp_path: Path) -> None:
         assert abs(np.mean(line)) < 0.25 * noise, (sigma, np.mean(line) / noise)
 
 
+SLOW, OWN = pytest.mark.slow, Sigmas(own=0.0012)
 SHARED = Sigmas(shift=0.004, tilt=0.002, scale=0.002, bend=0.004)
 
 
 @pytest.mark.parametrize(
-    "sigmas", [Sigmas(own=0.0012), SHARED, replace(SHARED, own=0.0012)],
-    ids=["own", "shared", "all"],
+    "sigmas",
+    [replace(SHARED, own=0.0012), *(pytest.param(s, marks=SLOW) for s in (OWN, SHARED))],
+    ids=["all", "own", "shared"],
 )  # fmt: skip
 def test_errors_are_as_large_as_their_sigmas(sigmas: Sigmas, tmp_path: Path) -> None:
     drawn, rng = Drawn(tmp_path, grid(1.0, 0.0125), hills, sigmas), np.random.default_rng(7)

@@ -73,6 +73,7 @@ def make_workspace(folder: Path, others: Sequence[str] = ()) -> None:
     write_dense(folder, [*(view.image for view in views), *others])
 
 
+@pytest.mark.slow
 def test_tasks_do_not_grow_with_the_survey(tmp_path: Path):
     make_workspace(tmp_path, [f"left/other_{n:05d}.png" for n in range(5000)])
     settings = SurveyConfig(reconstruct=ReconstructConfig(mesh_error_px=1.0))

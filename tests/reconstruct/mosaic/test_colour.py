@@ -7,11 +7,7 @@ import numpy as np
 import pytest
 
 from reconstruct.light.solve import GRID, LightSamples
-from reconstruct.mosaic.colour import (
-    Colour,
-    ColourModel,
-    solve_colour,
-)
+from reconstruct.mosaic.colour import Colour, ColourModel, solve_colour
 from reconstruct.mosaic.picture_measures import (
     PictureMeasures,
     ReferencePatch,
@@ -225,6 +221,7 @@ def oblique_chain() -> tuple[LightSamples, list[PictureMeasures]]:
     return shown_twice(rng, views, np.stack([x, y], axis=2), ranges), facts
 
 
+@pytest.mark.slow
 def test_light_does_not_drift_along_a_chain_of_oblique_pictures() -> None:
     samples, facts = oblique_chain()
     model = solve_colour("water", samples, facts)

@@ -157,6 +157,7 @@ def patches(north: np.ndarray, east: np.ndarray) -> np.ndarray:
                                         1.1 - 0.1 * np.cos(4.0 * north)], axis=-1)  # fmt: skip
 
 
+@pytest.mark.slow
 def test_borders_of_blocks_and_tiles_show_no_step(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

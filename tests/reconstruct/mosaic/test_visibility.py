@@ -10,16 +10,7 @@ from alice_survey.core.frames import BODY_FROM_NADIR_CAM
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from camera_calib.camera import Camera
 from camera_calib.water import channel_cameras
-from reconstruct.mosaic.visibility import (
-    Ground,
-    SeenCells,
-    Water,
-    camera_optics,
-    channel_optics,
-    lanczos_weights,
-    sample_lanczos,
-    see,
-)
+from reconstruct.mosaic import visibility
 from reconstruct.raster import DemGrid
 from reconstruct.views.model import View
 from reconstruct.views.range_shift import range_shift
@@ -40,7 +31,7 @@ def warp() -> PinholeWarp:
     return best_warp(CAMERA, 1.6, 2.5)
 
 
-SEA = Water(temperature_c=24.0, salinity_psu=39.0, depth_m=10.0)
+SEA = visibility.Water(temperature_c=24.0, salinity_psu=39.0, depth_m=10.0)
 
 
 def view_of(warp: PinholeWarp) -> View:
@@ -54,10 +45,10 @@ NORTH, EAST = np.meshgrid(GRID.north_of(np.arange(150) + 0.5), GRID.east_of(np.a
                           indexing="ij")  # fmt: skip
 HEIGHT = (-10.0 + 0.3 * NORTH - 0.25 * EAST).astype(np.float32)
 """A surface whose height spans a metre."""
-RELIEF = Ground(HEIGHT, GRID).surface(GRID)
+RELIEF = visibility.Ground(HEIGHT, GRID).surface(GRID)
 
 
-def misses_px(sight: SeenCells, camera: Camera) -> np.ndarray:
+def misses_px(sight: visibility.SeenCells, camera: Camera) -> np.ndarray:
     """How far from the exact pixel of a camera each cell of the relief is looked up."""
     world = np.stack([NORTH, EAST, -HEIGHT.astype(float)], axis=-1)
     points = view_of(warp()).world_from_cam.inv().apply(world.reshape(-1, 3))
@@ -66,7 +57,7 @@ def misses_px(sight: SeenCells, camera: Camera) -> np.ndarray:
 
 
 def test_points_are_looked_up_where_the_camera_behind_a_tilted_port_shows_them() -> None:
-    sight = see(view_of(warp()), camera_optics(warp(), True), RELIEF)
+    sight = visibility.see(view_of(warp()), visibility.camera_optics(warp(), True), RELIEF)
     inside = sight.quality > 0
     assert inside.mean() > 0.3
     error = misses_px(sight, CAMERA)
@@ -77,12 +68,12 @@ def test_points_are_looked_up_where_the_camera_behind_a_tilted_port_shows_them()
 def test_each_channel_is_looked_up_where_its_own_light_falls() -> None:
     view = view_of(warp())
     cameras = channel_cameras(CAMERA, temperature_c=24.0, salinity_psu=39.0, depth_m=10.0)
-    green = see(view, camera_optics(warp(), True), RELIEF)
+    green = visibility.see(view, visibility.camera_optics(warp(), True), RELIEF)
     moved = []
     for name, optics in zip(
-        ("blue", "green", "red"), channel_optics(warp(), SEA, True), strict=True
+        ("blue", "green", "red"), visibility.channel_optics(warp(), SEA, True), strict=True
     ):
-        sight = see(view, optics, RELIEF)
+        sight = visibility.see(view, optics, RELIEF)
         inside = (sight.quality > 0) & (green.quality > 0)
         assert misses_px(sight, cameras[name])[inside].max() < 0.05
         moved.append(np.hypot(sight.x - green.x, sight.y - green.y)[inside].max())
@@ -100,7 +91,7 @@ def test_lanczos_equals_its_definition_inside_and_at_edges(seed: int) -> None:
     y = rng.uniform(0, 19, (1, 40)).astype(np.float32)
     x[0, 0] = -1
     found = np.full((1, 40, 3), -7, np.float32)
-    sample_lanczos(picture, table, lanczos_weights(), x, y, 0, 3, found)
+    visibility.sample_lanczos(picture, table, visibility.lanczos_weights(), x, y, 0, 3, found)
     assert (found[0, 0] == -7).all()
     light = table[picture].astype(float)
     expected = np.stack([lanczos_at(light, a, b) for a, b in zip(x[0], y[0], strict=True)])
@@ -108,5 +99,5 @@ def test_lanczos_equals_its_definition_inside_and_at_edges(seed: int) -> None:
 
 
 def test_forgetting_the_range_would_show() -> None:
-    sight = see(view_of(warp()), camera_optics(warp(), False), RELIEF)
+    sight = visibility.see(view_of(warp()), visibility.camera_optics(warp(), False), RELIEF)
     assert misses_px(sight, CAMERA)[sight.quality > 0].max() > 0.1

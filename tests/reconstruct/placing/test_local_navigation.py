@@ -101,9 +101,7 @@ def test_attitudes_turn_a_model_of_one_camera_without_a_scale(
     assert "heading by navigation" in placed.frame.notes[-1]
 
 
-def test_depths_of_a_track_without_relief_give_no_scale(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_depths_of_a_track_without_relief_give_no_scale(capsys: pytest.CaptureFixture[str]) -> None:
     records = [replace(r, sigma_depth_m=1.0) for r in with_only(exact(site()), "depth_m")]
     assert fit(site(), records, gauge(7, 2.0), known=False, datum=None) is None
     assert "too little for its scale" in capsys.readouterr().err

@@ -121,8 +121,7 @@ def test_errors_of_a_station_move_its_other_camera_on_its_arm() -> None:
     moved = []
     for draw in rng.multivariate_normal(np.zeros(6), covariance, 3000):
         turned = RigidTransform.from_components(
-            in_model.translation + draw[3:],
-            Rotation.from_rotvec(draw[:3]) * in_model.rotation,
+            in_model.translation + draw[3:], Rotation.from_rotvec(draw[:3]) * in_model.rotation
         )
         moved.append(RigidTransform.concatenate([world(turned), world(turned * arm)]))
     true = RigidTransform.concatenate([world(pose) for pose in both])

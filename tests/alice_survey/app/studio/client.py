@@ -12,20 +12,12 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from alice_survey.app.studio.server import Server
+from tests.engines import until
 
 T = TypeVar("T")
 
 FOLDED = "sessionStorage.setItem('alice-survey layers', 'closed')"
 """Script of a page that keeps the list of layers from what is clicked on the map."""
-
-
-def until(look: Callable[[], T | None], within_s: float = 60.0) -> T:
-    """The first thing seen that counts as true."""
-    end_s = time.monotonic() + within_s
-    while not (found := look()):
-        assert time.monotonic() < end_s, f"it did not happen: {found}"
-        time.sleep(0.05)
-    return found
 
 
 def still(look: Callable[[], T], during_s: float = 0.4) -> T:

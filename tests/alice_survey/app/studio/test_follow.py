@@ -12,7 +12,8 @@ import pytest
 
 from alice_survey.app.studio.endpoints.follow import _COLOURS
 from alice_survey.app.studio.server import Server
-from tests.alice_survey.app.studio.client import ask, call, serving, until
+from tests.alice_survey.app.studio.client import ask, call, serving
+from tests.engines import until
 from tests.missions.follow.dives import text_of, workspace_of
 from tests.missions.follow.test_dive import BROKEN, PLAN, ROWS, UNTIL_S
 

@@ -22,11 +22,10 @@ from alice_survey.app.studio.jobs import (
     RunState,
 )
 from alice_survey.core.errors import AliceError
-from tests.alice_survey.app.studio.client import until
+from tests.engines import until
 
 PROGRAM = """
 import json, os, signal, subprocess, sys, time
-signal.signal(signal.SIGINT, signal.default_int_handler)  # tests in the background are deaf to it
 path = next(a.split("=", 1)[1] for a in sys.argv if a.startswith("--log-file="))
 def tell(**event):
     with open(path, "a") as file:

@@ -17,18 +17,8 @@ import pytest
 from numpy.typing import NDArray
 
 from reconstruct.placing.control_points import read_control, read_picks
+from tests.alice_survey.app.studio import journey_page
 from tests.alice_survey.app.studio.client import ask, looks_at, serving, still
-from tests.alice_survey.app.studio.journey_page import (
-    LONG_MS,
-    NARROW,
-    WIDE,
-    begun_page,
-    button,
-    made,
-    opened,
-    survey_begun,
-    survey_flown,
-)
 from tests.alice_survey.app.studio.picture_page import PicturePage, said
 from tests.alice_survey.app.studio.test_model_browser import click, kept
 from tests.alice_survey.app.studio.test_model_browser import named as figures
@@ -43,7 +33,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("chromium")]
 @pytest.fixture
 def journey() -> Iterator[tuple[Any, Heard]]:
     """A page, 1280 px wide, and what it complains about."""
-    with begun_page(WIDE) as page_and_heard:
+    with journey_page.begun_page(journey_page.WIDE) as page_and_heard:
         yield page_and_heard
 
 
@@ -54,15 +44,18 @@ def modelled(tmp_path_factory: pytest.TempPathFactory) -> Path:
     Its first half is seen at 1280 px, the second at 400.
     """
     folder = tmp_path_factory.mktemp("stereo")
-    with serving(folder / "reef") as server, begun_page(WIDE) as (page, heard):
-        survey_begun(page, server.address, length_m=1.3, width_m=1.5)
-        survey_flown(page)
-        page.set_viewport_size(NARROW)
-        button(page, "Make all that is left").click()
+    with (
+        serving(folder / "reef") as server,
+        journey_page.begun_page(journey_page.WIDE) as (page, heard),
+    ):
+        journey_page.survey_begun(page, server.address, length_m=1.3, width_m=1.5)
+        journey_page.survey_flown(page)
+        page.set_viewport_size(journey_page.NARROW)
+        journey_page.button(page, "Make all that is left").click()
         done = page.get_by_role("heading", name="Make all that is left: done")
-        done.wait_for(timeout=LONG_MS)
-        made(page, "mesh")
-        is_accessible(page, folder / "modelled.png", (WIDE, NARROW))
+        done.wait_for(timeout=journey_page.LONG_MS)
+        journey_page.made(page, "mesh")
+        is_accessible(page, folder / "modelled.png", (journey_page.WIDE, journey_page.NARROW))
         assert heard.complaints == []
     return folder / "reef"
 
@@ -110,8 +103,8 @@ def test_control_points_are_picked_and_their_residuals_shown(
             page.get_by_label("Point", exact=True).select_option(f"P{number}")
             for label, coordinate in zip(("North, m", "East, m", "Depth, m"), place, strict=True):
                 page.get_by_label(label, exact=True).fill(f"{coordinate:.4f}")
-            button(page, "Save to control.csv").click()
-            button(page, f"Delete point P{number}").wait_for()
+            journey_page.button(page, "Save to control.csv").click()
+            journey_page.button(page, f"Delete point P{number}").wait_for()
 
         for number, place in enumerate(places):
             save_known(number, place)
@@ -133,10 +126,10 @@ def test_control_points_are_picked_and_their_residuals_shown(
         rows.filter(has_text="BAD").first.wait_for()
         is_accessible(page, tmp_path / "control.png")
 
-        button(page, "Open P1").click()
+        journey_page.button(page, "Open P1").click()
         page.wait_for_selector(".picture-view[data-ready]")
         is_accessible(page, tmp_path / "picks.png")
-        button(page, "Delete P2").click()
+        journey_page.button(page, "Delete P2").click()
         said(page, "Took P2")
         assert {pick.point for pick in read_picks(workspace / "picks.csv")} == {"P0", "P1"}
         assert heard.complaints == []
@@ -184,52 +177,54 @@ def test_a_divers_folder_becomes_a_scaled_model_with_a_measured_coral(
     bar = [floor(0.5, 0.2), floor(1.7, 0.9)]
     coral = [floor(0.8, 0.9), floor(1.5, 0.3)]
     with serving(workspace) as server:
-        page.set_viewport_size(NARROW)
+        page.set_viewport_size(journey_page.NARROW)
         page.goto(server.address)
-        button(page, "I have pictures").click()
+        journey_page.button(page, "I have pictures").click()
         page.get_by_label("Folder of the pictures").fill(str(tmp_path / "card"))
-        button(page, "Look into it").click()
+        journey_page.button(page, "Look into it").click()
         page.get_by_text(f"Found: {len(frames)} pictures").wait_for()
-        is_accessible(page, tmp_path / "found.png", (WIDE, NARROW))
-        button(page, "Import them").click()
-        page.get_by_role("heading", name="Import pictures: done").wait_for(timeout=LONG_MS)
-        button(page, "Reconstruct the sea floor").click()
-        made(page, "mesh")
+        is_accessible(page, tmp_path / "found.png", (journey_page.WIDE, journey_page.NARROW))
+        journey_page.button(page, "Import them").click()
+        page.get_by_role("heading", name="Import pictures: done").wait_for(
+            timeout=journey_page.LONG_MS
+        )
+        journey_page.button(page, "Reconstruct the sea floor").click()
+        journey_page.made(page, "mesh")
         page.get_by_role("heading", name="Reconstruct the sea floor: done").wait_for()
 
         with (workspace / "images" / "manifest.csv").open(newline="") as rows:
             images = sorted(row["image"] for row in csv.DictReader(rows))
-        opened(page, "Pictures")
+        journey_page.opened(page, "Pictures")
         page.get_by_label("Sigma of a pick by eye, px").fill("0.05")
         for number, point in enumerate((*bar, *coral)):
-            page.set_viewport_size((WIDE, NARROW)[number % 2])
+            page.set_viewport_size((journey_page.WIDE, journey_page.NARROW)[number % 2])
             pick(page, f"end {number}", frames, point, images)
         for number in range(2):
             page.get_by_label(f"end {number}", exact=True).check()
         true = float(np.linalg.norm(bar[1] - bar[0]))
         page.get_by_label("Its true length, m").fill(f"{true:.6f}")
-        button(page, "Set the scale").click()
+        journey_page.button(page, "Set the scale").click()
         page.locator("#status", has_text="reconstruct").wait_for()
         assert (workspace / "scale.json").is_file()
-        opened(page, "Run")
+        journey_page.opened(page, "Run")
         page.wait_for_selector("[data-stage=placing]:not([data-state='up to date'])")
-        button(page, "Reconstruct the sea floor").click()
-        made(page, "mesh")
+        journey_page.button(page, "Reconstruct the sea floor").click()
+        journey_page.made(page, "mesh")
 
         page.reload()
-        opened(page, "Pictures")
+        journey_page.opened(page, "Pictures")
         true = float(np.linalg.norm(coral[1] - coral[0]))
         for number in (2, 3):
             page.get_by_label(f"end {number}", exact=True).check()
         page.wait_for_selector("[data-value]")
-        is_accessible(page, tmp_path / "coral.png", (WIDE, NARROW))
+        is_accessible(page, tmp_path / "coral.png", (journey_page.WIDE, journey_page.NARROW))
         shown = page.locator("[data-value]")
         off = float(shown.get_attribute("data-value")) - true
         assert abs(off) < 4.0 * float(shown.get_attribute("data-sigma"))
         assert abs(off) < 0.01 * true
 
-        opened(page, "Model")
-        for number, size in enumerate((NARROW, WIDE), start=1):
+        journey_page.opened(page, "Model")
+        for number, size in enumerate((journey_page.NARROW, journey_page.WIDE), start=1):
             page.set_viewport_size(size)
             measured_coral(page, number)
             is_accessible(page, tmp_path / "area.png")
@@ -243,9 +238,9 @@ def measured_coral(page: Any, number: int) -> None:
     still(lambda: looks_at(page))
     east, north = (float(box.get_attribute(f"data-{axis}")) for axis in ("east", "north"))
     corners = [(east - 0.2, north - 0.15), (east + 0.2, north - 0.15), (east, north + 0.2)]
-    button(page, "Area").click()
+    journey_page.button(page, "Area").click()
     click(page, *corners)
-    button(page, "Finish").click()
+    journey_page.button(page, "Finish").click()
     page.wait_for_selector(f"tr[data-measure='{number}']")
     measure = kept(page)[-1]
     places = np.array(measure["places"])

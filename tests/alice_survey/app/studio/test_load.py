@@ -13,7 +13,8 @@ from alice_survey.app.studio import server as studio_server
 from alice_survey.app.studio.endpoints.base import Call, Endpoint, Studio
 from alice_survey.app.studio.server import Server
 from tests.alice_survey.app.report.tiny import tiny_workspace
-from tests.alice_survey.app.studio.client import Reply, ask, refused, serving, until
+from tests.alice_survey.app.studio.client import Reply, ask, refused, serving
+from tests.engines import until
 
 WITHOUT = {"Cookie": ""}
 began: list[str] = []

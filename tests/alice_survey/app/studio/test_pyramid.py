@@ -9,11 +9,7 @@ import pytest
 import rasterio
 from numpy.typing import NDArray
 
-from alice_survey.app.report.rasters import (
-    MAP_RASTERS,
-    TILE_PX,
-    Pyramid,
-)
+from alice_survey.app.report.rasters import MAP_RASTERS, TILE_PX, Pyramid
 from alice_survey.app.studio.files import Workspace
 from alice_survey.app.studio.layers import Layers
 from alice_survey.core.artefacts import StaleError

@@ -72,7 +72,6 @@ def test_a_large_raster_in_little_memory_until_ctrl_c(tmp_path: Path) -> None:
         [sys.executable, "-m", "alice_survey", "studio", "-w", str(workspace), "--no-browser"],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         env={"TMPDIR": str(temporary), "PATH": ""},
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # if we are deaf
     )  # fmt: skip
     try:
         assert started.stdout is not None

@@ -16,8 +16,9 @@ from alice_survey.app.studio.endpoints.start import Folders
 from alice_survey.app.studio.jobs import Jobs
 from alice_survey.app.studio.server import Server
 from alice_survey.core.config import load_config
-from tests.alice_survey.app.studio.client import Reply, ask, call, refused, serving, until
+from tests.alice_survey.app.studio.client import Reply, ask, call, refused, serving
 from tests.alice_survey.app.studio.test_jobs import PROGRAM
+from tests.engines import until
 from tests.reconstruct.pictures.dated import navigation, take
 from tests.small_survey import settings_in
 
@@ -81,8 +82,7 @@ def test_a_fault_shows_its_line_and_the_way_on(server: Server) -> None:
 
 
 @pytest.mark.parametrize(
-    "path",
-    ["run/start", "run/stop", "start/folders", "start/preview", "start/survey"],
+    "path", ["run/start", "run/stop", "start/folders", "start/preview", "start/survey"]
 )
 def test_nothing_without_the_token(server: Server, tmp_path: Path, path: str) -> None:
     for token in (None, "wrong"):
@@ -190,6 +190,7 @@ def test_a_preview_tells_a_rig_from_one_camera(home: Path, server: Server) -> No
         refused(call(server, "/api/start/preview", wrong))
 
 
+@pytest.mark.slow
 def test_pictures_are_imported_as_a_job(home: Path, tmp_path: Path) -> None:
     folder = str(home / "dive" / "left")
     with serving(tmp_path / "w") as server:

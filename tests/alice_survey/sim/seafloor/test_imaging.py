@@ -134,6 +134,7 @@ def test_truth_holds_the_poses_that_were_flown(survey: Path) -> None:
     assert rig.cameras["left"] != rig.cameras["right"]
 
 
+@pytest.mark.slow
 def test_two_processes_give_the_same_bytes_as_one(survey: Path, tmp_path: Path) -> None:
     fly(tmp_path)
     assert spec("image").make(tmp_path, SETTINGS, local_executor(2))

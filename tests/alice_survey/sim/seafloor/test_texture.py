@@ -4,13 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from alice_survey.sim.seafloor.terrain import CERAMIC, ROCK, SAND
-from alice_survey.sim.seafloor.texture import (
-    SAND_ALBEDO,
-    Texture,
-    add_octave,
-    noise,
-    speck,
-)
+from alice_survey.sim.seafloor.texture import SAND_ALBEDO, Texture, add_octave, noise, speck
 from tests.oracles_seafloor import gradient_noise
 
 PIXEL_M = 0.00042

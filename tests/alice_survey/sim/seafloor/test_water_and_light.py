@@ -18,12 +18,7 @@ from alice_survey.sim.seafloor.light import (
     camera_light,
 )
 from camera_calib.camera import Camera
-from camera_calib.water import (
-    ASYMMETRY,
-    WaterOptics,
-    phase_per_sr,
-    water_optics,
-)
+from camera_calib.water import ASYMMETRY, WaterOptics, phase_per_sr, water_optics
 from tests.cameras import flat_port_camera
 from tests.oracles_seafloor import direct_light
 

@@ -47,6 +47,7 @@ def test_hidden_coefficients_and_current_are_recovered() -> None:
     assert not fit.at_bound.any()
 
 
+@pytest.mark.slow
 def test_drag_that_differs_up_and_down_is_told_apart() -> None:
     """The paper's ALICE rises 13 % slower than one Z_ww has it: 1.13^2 times the drag."""
     down = KNOWN.coefficients.values["Z_ww"]
@@ -87,6 +88,7 @@ def test_sigmas_are_honest_over_many_logs() -> None:
         assert 0.75 < each < 1.3
 
 
+@pytest.mark.slow
 def test_unseen_pushes_widen_the_sigmas() -> None:
     scores = []
     for seed in range(8):
@@ -130,6 +132,7 @@ def test_wrong_names_are_refused(names: tuple[str, ...], named: str) -> None:
         free_parameters(KNOWN, names)
 
 
+@pytest.mark.slow
 def test_where_a_log_says_little_the_start_is_kept_and_where_much_the_log() -> None:
     """In 10 s of noise, linear and quadratic drag look alike: the log alone splits them badly."""
     truth = {"X_uu": -12.0, "X_u": -3.0, "N_rr": -70.0}

@@ -43,6 +43,7 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return folder / "first.csv", folder / "second.csv"
 
 
+@pytest.mark.slow
 def test_the_joint_fit_writes_what_it_found(logs: tuple[Path, Path], tmp_path: Path) -> None:
     options = IdentifyOptions(free=("X_uu", "N_rr", "current"), validate=logs[1])
     text, data = identify_report([logs[0]], tmp_path / "out", options)

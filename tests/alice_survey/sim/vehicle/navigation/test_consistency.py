@@ -27,6 +27,7 @@ SUITES = {
     "drop-out": SensorSuite(dvl_dropouts_s=((200.0, 230.0),)),
     "usbl": SensorSuite(usbl=UsblSpec(rate_hz=0.2, boat_ned_m=(10.0, 5.0, 1.0))),
 }
+EACH = ["default", *(pytest.param(n, marks=pytest.mark.slow) for n in ("drop-out", "usbl"))]
 SPACING_M = 0.1
 
 
@@ -48,7 +49,7 @@ def test_errors_are_as_large_as_the_covariance_says(name: str, states: slice) ->
     assert np.mean((mean > low) & (mean < high)) >= 0.9
 
 
-@pytest.mark.parametrize("name", SUITES)
+@pytest.mark.parametrize("name", EACH)
 def test_innovations_are_white_and_of_unit_variance(name: str) -> None:
     # Compass, depth, the four beams, and what USBL there is; outliers stand far out.
     for place in (0, 1, 2, 3, 4, 5, 12, 13):
@@ -64,7 +65,7 @@ def test_innovations_are_white_and_of_unit_variance(name: str) -> None:
         assert abs(together) < 4.0 / np.sqrt(count) + 0.01
 
 
-@pytest.mark.parametrize("name", SUITES)
+@pytest.mark.parametrize("name", EACH)
 def test_sigmas_of_the_log_are_those_of_the_errors(name: str) -> None:
     truth = runs(name)[0].truth
     angles = Rotation.from_quat(truth[:, 3:7]).as_euler("ZYX")[:, ::-1]

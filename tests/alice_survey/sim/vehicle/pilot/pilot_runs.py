@@ -181,8 +181,15 @@ def guidance_of(path: Path, name: str, controller: Controller) -> Guidance:
     return pilot_guidance(gains, path, controller, max_depth_m=DEEPEST_M)
 
 
+@cache
 def straight(length_m: float, heading_rad: float = 0.0, speed_mps: float = 0.2) -> Path:
     return path_from_legs([(0.0, 0.0)], [heading_rad], [length_m], [0.0], [0], 2.0, speed_mps)
+
+
+@cache
+def guidance_along(name: str, controller: Controller) -> Guidance:
+    """For a straight path of 20 m."""
+    return guidance_of(straight(20.0), name, controller)
 
 
 Move = tuple[str, float] | tuple[str, float, int]

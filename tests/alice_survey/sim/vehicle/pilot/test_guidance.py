@@ -35,7 +35,7 @@ def estimate_of(motion: Array, cross_m: float = 0.0) -> Array:
 @given(motion=MOTIONS)
 @settings(deadline=None)
 def test_followed_point_moves_as_rotations_say(motion: Array) -> None:
-    guidance = runs.guidance_of(straight(20.0), "alice", "sway")
+    guidance = runs.guidance_along("alice", "sway")
     estimate, pilot = estimate_of(motion), slot.new_pilot()
     write_point(estimate, guidance, pilot)
     place, velocity, _ = oracle.point_motion(estimate, guidance)
@@ -52,7 +52,7 @@ def test_a_tick_asks_for_what_its_twin_asks(
     name: str, controller: runs.Controller, motion: Array, cross_m: float
 ) -> None:
     path, gains = straight(20.0), gains_of(name)
-    guidance = runs.guidance_of(path, name, controller)
+    guidance = runs.guidance_along(name, controller)
     estimate = estimate_of(motion, cross_m)
     place, _, _ = oracle.point_motion(estimate, guidance)
     pilot = slot.new_pilot()
@@ -70,7 +70,7 @@ def test_a_tick_asks_for_what_its_twin_asks(
 
 
 def test_the_floor_is_smoothed_as_its_transfer_function_says() -> None:
-    guidance = runs.guidance_of(straight(20.0), "alice", "sway")
+    guidance = runs.guidance_along("alice", "sway")
     rng = np.random.default_rng(2)
     heard = 15.0 + 0.02 * np.arange(800) * TICK_S + 0.05 * rng.standard_normal(800)
     pilot, smoothed = slot.new_pilot(), []

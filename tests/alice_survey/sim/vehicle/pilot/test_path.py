@@ -35,11 +35,7 @@ def test_places_are_those_reached_by_walking(curvature: float, length: float, sh
     assert k == (curvature if 0.0 <= along <= length else 0.0)
 
 
-@given(
-    curvature=st.floats(-2.0, 2.0),
-    share=st.floats(0.05, 0.95),
-    cross=st.floats(-0.35, 0.35),
-)
+@given(curvature=st.floats(-2.0, 2.0), share=st.floats(0.05, 0.95), cross=st.floats(-0.35, 0.35))
 @settings(deadline=None, max_examples=40)
 def test_progress_is_the_projection(curvature: float, share: float, cross: float) -> None:
     path = arc(curvature, 1.4)

@@ -1,6 +1,7 @@
 """Steering: inner loops by matrices, stops against their twin, and in closed loops."""
 
 import math
+from functools import cache
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from alice_survey.sim.vehicle import estimate_vector as vector
 from alice_survey.sim.vehicle.pilot import gains as g
 from alice_survey.sim.vehicle.pilot import memory as slot
 from alice_survey.sim.vehicle.pilot import steering
+from alice_survey.sim.vehicle.pilot.settings import Guidance
 from alice_survey.sim.vehicle.pilot.steering import STOP_M, STOP_RAD, ramp
 from tests import oracles_guidance as oracle
 from tests.alice_survey.sim.vehicle.pilot import pilot_runs as runs
@@ -51,14 +53,18 @@ def test_a_reference_goes_as_far_as_the_closed_form_says(
     assert time_s > total_s - 3 * TICK_S - 2.0 * math.sqrt(2.0 * TICK_S**2)
 
 
+@cache
+def along_steps() -> Guidance:
+    return runs.guidance_of(STEPS, "alice", "sway")
+
+
 @pytest.mark.parametrize(("leg", "progress"), [(1, 0.4), (2, 0.8), (0, 2.7)])
 @given(motion=MOTIONS, share=st.floats(0.0, 1.0))
 @settings(deadline=None, max_examples=60)
 def test_a_tick_of_a_stop_asks_for_what_its_twin_asks(
     leg: int, progress: float, motion: Array, share: float
 ) -> None:
-    path, gains, pilot = STEPS, runs.gains_of("alice"), slot.new_pilot()
-    guidance = runs.guidance_of(path, "alice", "sway")
+    path, gains, pilot, guidance = STEPS, runs.gains_of("alice"), slot.new_pilot(), along_steps()
     fastest = (0.2, guidance.step_mps, guidance.turn_in_place_rad_s)[leg]
     slowing = (guidance.stop_mps2, guidance.step_mps2, guidance.turn_in_place_rad_s2)[leg]
     goal = (path.length_m[0], path.length_m[1], abs(path.turn_rad[2]))[leg]
