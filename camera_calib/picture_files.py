@@ -21,6 +21,11 @@ MAX_PIXELS = 104_000_000
 """Most pixels of a picture: 0.8 GB of 4 channels and 16 bits. A small file can state any size."""
 MAX_PIXELS_JPEG = 160_000_000
 """Most pixels of a JPEG, whose pixels take half as much or less."""
+KINDS = {
+    "PNG": (".png",), "JPEG": (".jpg", ".jpeg", ".jfif"), "TIFF": (".tif", ".tiff"),
+    "BMP": (".bmp",), "PNM": (".pgm", ".ppm"), "WebP": (".webp",), "JPEG 2000": (".jp2",),
+}  # fmt: skip
+"""Pictures that are read, RAW of cameras apart, by the ends of their names."""
 PILLOW_FAULTS = (
     OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError, AttributeError,
     ArithmeticError, MemoryError, EOFError, RuntimeError, struct.error, zlib.error,
@@ -30,7 +35,6 @@ _YEARS = range(1970, 2200)
 """Years in which a digital camera can have taken a picture."""
 _EXIF, _DATE, _SUBSECOND, _OFFSET = 0x8769, 0x9003, 0x9291, 0x9011
 _ORIENTATION, _SHORT = 0x0112, 3
-_TIFF = (".tif", ".tiff")
 
 
 _NAME = re.compile(r"[A-Za-z0-9_-]+")
@@ -141,7 +145,7 @@ def read_pixels(path: Path, flags: int) -> NDArray[Any] | None:
     # OpenCV's own warnings would stand next to the line that the caller makes of it.
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
     try:
-        if path.suffix.lower() in _TIFF and flags & cv2.IMREAD_IGNORE_ORIENTATION:
+        if path.suffix.lower() in KINDS["TIFF"] and flags & cv2.IMREAD_IGNORE_ORIENTATION:
             data = without_orientation(ordinary_file(path, _MAX_BYTES).read_bytes())
             pixels: NDArray[Any] | None = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
         else:

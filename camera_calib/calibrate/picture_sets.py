@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from alice_survey.core.errors import CalibrationError, warn
+from camera_calib.picture_files import KINDS
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm")
+SUFFIXES = tuple(suffix for kind in KINDS.values() for suffix in kind)
 _MIN_PAIRED = 0.5
 """Share of each list whose numbers must be in another for names to pair."""
 _NAMED = 3

@@ -200,7 +200,7 @@ def read_bathymetry(
                 raise PlanError(f"{path}: names no coordinate system; give area.crs, as EPSG:32636")
             flat = _flat_wkt(file.crs.to_wkt() if file.crs else str(crs), path)
             window = _window(path, file, flat, datum, bounds_ne)
-            band = _known(path, file.read(1, window=Window(*window), masked=True))
+            band = _without_unknown(path, file.read(1, window=Window(*window), masked=True))
             heights = sense == "heights" if sense != "auto" else _are_heights(path, file, band)
             scale, offset = file.scales[0], file.offsets[0]
             a, b, c, d, e, f = tuple(file.transform)[:6]
@@ -245,7 +245,7 @@ _SHALLOW = 0.5
 _SOME = 0.01
 
 
-def _known(path: Path, band: Any) -> Any:
+def _without_unknown(path: Path, band: Any) -> Any:
     """Values of a raster without those that stand for "not known", which it need not declare.
 
     Zero is one where it is in a hundredth of the cells and the others are far from it.

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from alice_survey.core.contents import as_line, is_nowhere, one_line, ordinary_file
 from alice_survey.core.errors import ImageError
 from camera_calib.picture_files import (
+    KINDS,
     PILLOW_FAULTS,
     exif_time,
     pixels_too_many,
@@ -27,8 +28,8 @@ from camera_calib.picture_files import (
 )
 
 HEIC = (".heic", ".heif", ".hif", ".avif")
-PLAIN = (".jpg", ".jpeg", ".png")
-TIFF = (".tif", ".tiff")
+COPIED = (".jpg", ".jpeg", ".png")
+"""Pictures of 8 bits that are copied as they are."""
 RAW = (
     ".3fr", ".arw", ".cr2", ".cr3", ".dng", ".erf", ".gpr", ".iiq", ".kdc", ".mef", ".mos", ".mrw",
     ".nef", ".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw", ".x3f",
@@ -85,7 +86,7 @@ class PictureFolder:
     pictures: tuple[Path, ...]
     """Pictures in the order of the numbers in their names."""
     masks: tuple[Path, ...]
-    """`NAME_mask.png` next to the picture `NAME.*`."""
+    """`NAME_mask.*` or `NAME.*.png` next to the picture `NAME.*`."""
     left_out: Mapping[str, tuple[Path, ...]]
     """What is not a picture that can be read, by reason."""
 
@@ -116,7 +117,8 @@ def look_into(
     except OSError as error:
         raise ImageError(f"{folder}: cannot be read: {error.strerror}") from None
     inside.sort(key=lambda p: [(natural_key(part), part) for part in p.relative_to(folder).parts])
-    stems = {p.with_suffix("") for p in inside if kind_of(p)}
+    listed = {str(path).lower() for path in inside if kind_of(path)}
+    stems = listed | {str(path.with_suffix("")).lower() for path in inside if kind_of(path)}
     pictures: list[Path] = []
     masks: list[Path] = []
     left_out: dict[str, list[Path]] = {reason: [] for reason in ADVICE}
@@ -129,13 +131,13 @@ def look_into(
             left_out[reason].append(path)
         else:
             own = path.stem.removesuffix("_mask")
-            is_mask = own != path.stem and path.with_name(own) in stems
+            is_mask = str(path.with_name(own)).lower() in (listed if own == path.stem else stems)
             (masks if is_mask else pictures).append(path)
     if not pictures:
         held = [f"{len(paths)} {reason}; {ADVICE[reason]}" for reason, paths in left_out.items()
                 if paths]  # fmt: skip
         raise ImageError(
-            f"{folder}: holds no pictures (JPEG, PNG, TIFF or camera RAW)"
+            f"{folder}: holds no pictures ({', '.join(KINDS)} or camera RAW)"
             + (f", but {', '.join(held)}" if held else "")
         )
     return PictureFolder(
@@ -147,9 +149,9 @@ def look_into(
 
 
 def kind_of(path: Path) -> str:
-    """`JPEG`, `PNG`, `TIFF` or `RAW` by the name of a file; empty for all others."""
-    kinds = {"PNG": (".png",), "JPEG": PLAIN, "TIFF": TIFF, "RAW": RAW}
-    return next((kind for kind, names in kinds.items() if path.suffix.lower() in names), "")
+    """A kind of `KINDS`, or `RAW`, by the name of a file; empty for all others."""
+    suffix, kinds = path.suffix.lower(), {**KINDS, "RAW": RAW}
+    return next((kind for kind, names in kinds.items() if suffix in names), "")
 
 
 def list_names(names: Sequence[str], maximum: int = 8) -> str:
@@ -213,7 +215,7 @@ def decode(path: Path) -> NDArray[Any]:
         raise ImageError(f"states over {maximum / 1e6:.0f} million pixels: make it smaller")
     if suffix in RAW:
         return _develop(path)
-    if suffix in PLAIN:
+    if suffix not in KINDS["TIFF"]:
         with _pillow(path) as image:  # it refuses truncated files; OpenCV fills them with grey
             image.load()
     pixels = read_pixels(path, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
@@ -355,7 +357,7 @@ def copy_picture(task: tuple[Path, Path, int]) -> None:
     """
     source, target, bits = task
     target.parent.mkdir(parents=True, exist_ok=True)
-    if source.suffix.lower() in PLAIN and target.suffix == source.suffix.lower() and bits == 8:
+    if source.suffix.lower() in COPIED and target.suffix == source.suffix.lower() and bits == 8:
         if _with_exif(PictureFacts(path=source)).orientation == 1:
             shutil.copyfile(source, target)
             return

@@ -456,8 +456,8 @@ def import_images(
         vertical_datum: name of the level that the depths of navigation count from, such as that of
             the tide which `import-log` took off; None for the sea surface.
         rig: `rig.json` of the cameras; its lever arm says that navigation is of the body.
-        masks: folder of masks (0 = leave out) with the stems of the pictures, or with a folder per
-            camera; without it `NAME_mask.png` next to a picture is its mask.
+        masks: folder of masks (0 = leave out), see `with_masks`, or with a folder per camera;
+            without it those next to pictures.
         triggers: CSV with the time of every picture, see `pair_by_time`.
         executor: where tasks run.
 
@@ -537,7 +537,7 @@ def import_images(
                 entries = [replace(entry, camera=by_key[entry.facts.key]) for entry in entries]
         incoming.check_entries(entries, scan.rig)
         entries = incoming.unique_names(entries)
-        entries = [replace(e, mask=incoming.mask_of(e, masks, bool(cameras))) for e in entries]
+        entries = incoming.with_masks(entries, masks, stereo=bool(cameras))
         if not scan.videos:
             notes += incoming.copy_all(entries, partial, executor)
             shutil.rmtree(partial / _SCRATCH, ignore_errors=True)

@@ -27,7 +27,7 @@ from alice_survey.core.frames import Array
 from alice_survey.core.manifest import ImageRecord
 from alice_survey.core.records import PlaceRecord
 from camera_calib.calibrate.picture_sets import pair_pictures
-from camera_calib.picture_files import time_taken
+from camera_calib.picture_files import KINDS, time_taken
 from camera_calib.rig import Rig
 from missions.logs.dive import finite_number
 from missions.logs.navigation_csv import (
@@ -43,6 +43,7 @@ from reconstruct.pictures.files import (
     bits_used,
     copy_picture,
     inspect,
+    kind_of,
     list_names,
     safe_name,
     target_suffix,
@@ -595,19 +596,37 @@ def _bits(entries: Sequence[Incoming]) -> dict[str, int]:
     return {camera: bits_used(value) for camera, value in sorted(highest.items())}
 
 
-def mask_of(entry: Incoming, masks: Path | None, stereo: bool) -> Path | None:
-    """The mask of a picture, in the folder of masks or next to it; None where it has none."""
-    stem = entry.source.stem
-    names = [f"{stem}.png", f"{stem}_mask.png", f"{stem}.jpg", f"{stem}.tif"]
-    if masks is None:
-        places = [entry.source.with_name(f"{stem}_mask.png")]
-    else:
-        places = [masks / entry.camera / name for name in names]
-        if not stereo:
-            places += [masks / name for name in names]
-    found = next((path for path in places if path.is_file()), None)
-    if found is not None:
-        read_mask(found, (entry.facts.width_px, entry.facts.height_px))
+def with_masks(entries: Sequence[Incoming], masks: Path | None, *, stereo: bool) -> list[Incoming]:
+    """Pictures with the masks in a folder of masks, or next to them; others are named.
+
+    A mask of `P1.JPG` is `P1.png`, `P1.JPG.png`, as COLMAP has it, or `P1_mask` of any kind, as
+    OpenDroneMap has it, in either case; next to the picture one of the last two.
+    """
+    files: dict[Path, dict[str, Path]] = {}
+    found: list[Incoming] = []
+    for entry in entries:
+        name, stem = entry.source.name.lower(), entry.source.stem.lower()
+        ends = [end for kind in KINDS.values() for end in kind]
+        wanted = [f"{name}.png", f"{name}_mask.png", *(f"{stem}_mask{end}" for end in ends)]
+        folders = [entry.source.parent]
+        if masks is not None:
+            wanted = [f"{stem}.png", *wanted, *(f"{stem}{end}" for end in ends)]
+            folders = [masks / entry.camera, *([] if stereo else [masks])]
+        for folder in set(folders) - set(files):
+            inside = sorted(folder.iterdir()) if folder.is_dir() else []
+            files[folder] = {path.name.lower(): path for path in inside}
+        there = (files[folder].get(one) for folder in folders for one in wanted)
+        mask = next((one for one in there if one is not None), None)
+        if mask is not None:
+            read_mask(mask, (entry.facts.width_px, entry.facts.height_px))
+        found.append(replace(entry, mask=mask))
+    if masks is not None:
+        used = {entry.mask for entry in found}
+        lost = [p for own in files.values() for p in own.values() if kind_of(p) and p not in used]
+        if lost or used == {None}:
+            count = sum(len(own) for own in files.values())
+            warn(f"{len(used - {None})} of {count} masks belong to a picture, not "
+                 f"{list_names([p.name for p in lost], 3)}: name them as the pictures")  # fmt: skip
     return found
 
 

@@ -162,6 +162,19 @@ def test_sixteen_bits_become_eight_by_one_gain_per_camera(tmp_path: Path) -> Non
     assert any("12 bits" in note for note in read_json(images / "survey.json")["notes"])
 
 
+@pytest.mark.parametrize("suffix", ["bmp", "ppm", "webp", "jp2", "PNG"])
+def test_every_kind_of_picture_keeps_its_pixels(tmp_path: Path, suffix: str) -> None:
+    pixels = np.random.default_rng(3).integers(0, 256, (48, 64, 3))
+    several(tmp_path, 1)
+    exact = cv2.IMWRITE_JPEG2000_COMPRESSION_X1000
+    lossless = {"webp": [cv2.IMWRITE_WEBP_QUALITY, 101], "jp2": [exact, 1000]}
+    cv2.imwrite(
+        str(tmp_path / "in" / f"a.{suffix}"), pixels.astype(np.uint8), lossless.get(suffix, [])
+    )
+    import_images(tmp_path / "w", [tmp_path / "in"])
+    np.testing.assert_array_equal(cv2.imread(str(tmp_path / "w/images/camera/a.png")), pixels)
+
+
 def test_gps_of_exif_gives_positions_and_a_datum(tmp_path: Path) -> None:
     places = [(-33.5, 151.25, 12.5), (-33.5001, 151.2501, 13.0), (-33.5002, 151.25, -2.0)]
     for number, place in enumerate(places):
@@ -233,6 +246,30 @@ def test_masks_come_along(tmp_path: Path) -> None:
     records = read_manifest(images / "manifest.csv")
     assert [bool(r.mask) for r in records] == [False, False, True]
     np.testing.assert_array_equal(cv2.imread(str(images / records[2].mask), 0), (apart > 0) * 255)
+
+
+@pytest.mark.parametrize("name", ["1.jpg.png", "1_mask.JPG", "1.PNG", "1.JPG_mask.png", "1.TIF"])
+@pytest.mark.parametrize("apart", [True, False])
+def test_masks_are_found_by_the_names_that_other_programs_give(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, apart: bool
+) -> None:
+    if not apart and "." in name[:2] and "jpg" not in name.lower():
+        return  # next to the pictures it is one of them
+    several(tmp_path, 2)
+    mask = np.full((48, 64), 255, np.uint8)
+    mask[:16] = 0
+    folder = tmp_path / ("masks" if apart else "in")
+    folder.mkdir(exist_ok=True)
+    cv2.imwrite(str(folder / name), mask)
+    import_images(tmp_path / "w", [tmp_path / "in"], masks=folder if apart else None)
+    records = rows_of(tmp_path / "w")
+    assert [bool(r.mask) for r in records] == [False, True]
+    assert (cv2.imread(str(tmp_path / "w/images" / records[1].mask), 0) == mask).all()
+    assert "mask" not in capsys.readouterr().err
+    if apart:
+        (folder / name).rename(folder / f"other{name}")
+        import_images(tmp_path / "w", [tmp_path / "in"], masks=folder)
+        assert "0 of 1 masks" in capsys.readouterr().err
 
 
 def test_names_stay_inside_and_apart(tmp_path: Path) -> None:
