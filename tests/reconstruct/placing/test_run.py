@@ -82,6 +82,7 @@ def test_a_drone_block_is_registered_scaled_and_placed_by_its_gps(drone: Path) -
         assert view.world_from_cam.rotation.apply([0, 0, 1])[2] > 0.95  # looks down
 
 
+@pytest.mark.slow
 def test_two_processes_give_the_same_bytes(drone: Path, tmp_path: Path) -> None:
     other = tmp_path / "other"
     import_images(other, [drone / "in"])
@@ -166,6 +167,7 @@ def test_without_positions_the_model_is_level_unscaled_and_says_so(nowhere: Path
         reconstruct(nowhere, QUICK, SERIAL)
 
 
+@pytest.mark.slow
 def test_real_stereo_without_calibration_gets_one_rigid_rig(
     shared_data: Path, tmp_path: Path
 ) -> None:
@@ -211,6 +213,7 @@ def test_a_rig_of_other_pictures_is_refused(drone: Path, tmp_path: Path) -> None
         reconstruct(folder, QUICK, SERIAL)
 
 
+@pytest.mark.slow
 def test_ground_control_of_handheld_gps_is_fitted_robustly(
     drone: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

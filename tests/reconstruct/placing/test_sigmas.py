@@ -25,6 +25,7 @@ from reconstruct.placing.navigation import USUAL_INSTALLATION, Installation
 from reconstruct.placing.place import fit_with_mount
 from tests.oracles_place import covariance_matrix, standard_residuals_densely
 
+SLOW = pytest.mark.slow
 DATUM = Datum(32.8236, 34.9553)
 SIGMA = np.array([0.06, 0.06, 0.05, *np.deg2rad([0.05, 0.05, 0.3])])
 """Of north, east, depth (m), roll, pitch, heading (rad)."""
@@ -123,7 +124,7 @@ def place(
     return fit, errors, np.r_[sigma[3:6], sigma[:3], sigma[6]]
 
 
-@pytest.mark.parametrize("tau_s", [1.0, 40.0, 4000.0])
+@pytest.mark.parametrize("tau_s", [40.0, *(pytest.param(t, marks=SLOW) for t in (1.0, 4000.0))])
 def test_errors_over_their_sigmas_are_of_unit_size(tau_s: float) -> None:
     """From white errors to ones that outlast the survey; a wrong independence gives 3 to 7."""
     body, ratios = flight(), []
@@ -214,7 +215,7 @@ def test_a_clock_that_is_off_by_more_than_stated_is_named_with_its_setting(
     assert abs(abs(value) - 1.0) < 4 * sigma < 1.0
 
 
-@pytest.mark.parametrize("drift_m", [0.0, 0.036, 0.4])
+@pytest.mark.parametrize("drift_m", [0.036, *(pytest.param(d, marks=SLOW) for d in (0.0, 0.4))])
 def test_a_drift_of_depths_is_named_and_costs_the_depth(
     drift_m: float, capsys: pytest.CaptureFixture[str]
 ) -> None:
