@@ -366,6 +366,7 @@ def test_long_gaps_lie_between_dives() -> None:
     assert dives_of(400.0 * np.arange(5.0)).tolist() == [0] * 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("restart", [True, False])
 def test_two_dives_are_as_sure_as_their_errors_are_independent(restart: bool) -> None:
     found, stated, restarts = [], [], []
@@ -384,6 +385,7 @@ def test_two_dives_are_as_sure_as_their_errors_are_independent(restart: bool) ->
         assert 0.75 < share < 1.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("jump_m", [0.5, 5.0])
 def test_dives_that_contradict_each_other_leave_the_place_that_unsure(jump_m: float) -> None:
     ratios = []
