@@ -315,7 +315,8 @@ class GridHeights:
         grid = self.grid.window(
             rows.start, columns.start, rows.stop - rows.start, columns.stop - columns.start
         )
-        return replace(self, grid=grid, height=self.height[rows, columns])
+        height = np.ascontiguousarray(self.height[rows, columns])
+        return replace(self, grid=grid, height=height)
 
 
 def visible_over(view: View, dem: Float32, around: DemGrid, stored: Path | None = None) -> Visible:
