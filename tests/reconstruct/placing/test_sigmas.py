@@ -446,12 +446,14 @@ def whitened(factor: float) -> tuple[Array, Array]:
     return np.array(found), np.array(off)
 
 
+@pytest.mark.slow
 def test_modes_of_the_stated_size_stay_as_they_are() -> None:
     found, off = whitened(1.0)
     assert np.count_nonzero(found > 1.0) <= 1
     assert 0.8 < np.sqrt((off**2).mean()) < 1.2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [2.5, 6.0])
 def test_modes_larger_than_stated_are_found_and_their_sigmas_are_true(factor: float) -> None:
     found, off = whitened(factor)
@@ -477,6 +479,7 @@ def bends_of(
     return fit.bends
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tau_s", [1.0, 4000.0])
 def test_a_bent_block_shows_its_curvature(tau_s: float) -> None:
     body = flight(8, 40)
@@ -491,6 +494,7 @@ def test_a_bent_block_shows_its_curvature(tau_s: float) -> None:
         assert along.is_significant(1e-3)
 
 
+@pytest.mark.slow
 def test_straight_blocks_are_not_called_bent_and_sigmas_are_true() -> None:
     body, pulls, called = flight(6, 20), [], 0
     for seed in range(30):
@@ -556,6 +560,7 @@ def with_mount(words: str, seed: int) -> tuple[PlacementFit, RigidTransform, Arr
     return fit, mount, np.roll(errors_of(fit, truth, poses), 3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", ["nadir-bow-left", "forward+45"])
 def test_the_mount_is_found_within_its_sigmas(words: str) -> None:
     turns, arms, places = [], [], []
