@@ -430,7 +430,7 @@ def see(
     lens = replace(view, shift=optics.shift).kernel_lens
     found = look_up(
         surface.height,
-        requested,
+        (np.ascontiguousarray(requested[0]), requested[1]),
         visible.cells,
         ((visible.north - north) / cell - 0.5, (east - visible.west) / cell - 0.5),
         grid.cell / cell,
