@@ -288,7 +288,8 @@ def _collapse(
             for k in range(3):
                 if faces[face, k] == b:
                     faces[face, k] = a
-        place[a] = target_place[n]
+        for k in range(3):
+            place[a, k] = target_place[n, k]
         for k in range(11):
             quadrics[a, k] += quadrics[b, k]
         gone += 1
