@@ -17,8 +17,8 @@ from typing import Any, ParamSpec, TypeVar, cast, overload
 
 import numpy as np
 from filelock import Timeout
-from llvmlite.binding import parse_bitcode
 from numba import njit
+from numba.core.codegen import ll
 from numba.core.compiler import Compiler, CompileResult
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.registry import CPUDispatcher
@@ -105,7 +105,7 @@ def _load_inner(target: Any, kept: Any) -> Any:
     """A kernel that is kept for its callers."""
     (_, _, bitcode), *values, environments = kept
     code = _code_to_link(target)
-    code._final_module, code._environments = parse_bitcode(bitcode), environments
+    code._final_module, code._environments = ll.parse_bitcode(bitcode), environments
     code._finalize_final_module()
     inner = target.subtarget(get_executable=_name_version)
     inner.codegen = lambda: SimpleNamespace(unserialize_library=lambda _: code)
@@ -133,6 +133,11 @@ class _Kernel(CPUDispatcher):  # type: ignore[misc]
         outer.__qualname__ = f"{plain.__qualname__}.entry"
         options = self.targetoptions.items()
         return _kept(outer, {key: value for key, value in options if key not in _NOT_OF_ENTRY})
+
+    @property
+    def stats(self) -> Any:
+        """What Python's calls have loaded and compiled."""
+        return self.entry.stats
 
     def _compile_for_args(self, *args: Any, **named: Any) -> Any:
         called = self.entry._compile_for_args(*args, **named)

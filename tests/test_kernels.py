@@ -1,0 +1,32 @@
+"""How often the kernels of the tutorial's commands are compiled."""
+
+import pickle
+from collections import defaultdict
+from pathlib import Path
+
+import pytest
+
+from tests.small_survey import settings_in, start
+
+pytestmark = pytest.mark.slow
+
+ALLOWED: dict[str, int] = {}
+"""Numbers of versions of kernels that have more than one, each with its reason."""
+
+
+def test_the_kernels_of_a_survey_have_one_version_each(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each combination of types of arguments is compiled for itself: literals and flags count."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kernels"))
+    assert start(settings_in(tmp_path / "survey"), threads=1).wait() == 0
+
+    versions: defaultdict[str, set[object]] = defaultdict(set)
+    for index in (tmp_path / "kernels").rglob("*.nbi"):
+        with index.open("rb") as file:
+            pickle.load(file)
+            _, kept = pickle.load(file)
+        versions[index.name.rpartition("-")[0]].update(kept)
+    several = {name: len(kinds) for name, kinds in versions.items() if len(kinds) > 1}
+    assert several == ALLOWED
+    assert len(versions) > 200
