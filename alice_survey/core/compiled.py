@@ -53,8 +53,9 @@ def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
         # A copy of such a kernel in the code of its caller may round in another way than its own
         # code, and whichever is loaded first is called: results would depend on what was compiled
         # before. What is inlined is always that of the caller.
-        rounding = {"forceinline": True} if options.get("fastmath") else {}
-        kernel = _kept(plain, {**rounding, **options, **_INNER})
+        if options.get("fastmath"):
+            return _compile_and_keep(plain, {"forceinline": True, **options})
+        kernel = _compile_and_keep(plain, {**options, **_INNER})
         if isinstance(kernel, CPUDispatcher):
             kernel.__class__ = _Kernel
             kernel._cache._impl.rebuild = _load_inner
@@ -63,7 +64,7 @@ def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
     return decorate if function is None else decorate(function)
 
 
-def _kept(plain: Callable[..., Any], options: dict[str, Any]) -> Any:
+def _compile_and_keep(plain: Callable[..., Any], options: dict[str, Any]) -> Any:
     """Compile a function, and keep the result on disk as long as its call closure is the same."""
     kernel = njit(cache=True, **options)(plain)
     index: Any = getattr(getattr(kernel, "_cache", None), "_cache_file", None)
@@ -132,12 +133,18 @@ class _Kernel(CPUDispatcher):  # type: ignore[misc]
         outer.__kwdefaults__, outer.__module__ = plain.__kwdefaults__, plain.__module__
         outer.__qualname__ = f"{plain.__qualname__}.entry"
         options = self.targetoptions.items()
-        return _kept(outer, {key: value for key, value in options if key not in _NOT_OF_ENTRY})
+        return _compile_and_keep(
+            outer, {key: value for key, value in options if key not in _NOT_OF_ENTRY}
+        )
 
     @property
     def stats(self) -> Any:
-        """What Python's calls have loaded and compiled."""
-        return self.entry.stats
+        """What was loaded and compiled, for Python and for other kernels."""
+        own, calls = super().stats, self.entry.stats
+        return calls._replace(
+            cache_hits=own.cache_hits + calls.cache_hits,
+            cache_misses=own.cache_misses + calls.cache_misses,
+        )
 
     def _compile_for_args(self, *args: Any, **named: Any) -> Any:
         called = self.entry._compile_for_args(*args, **named)

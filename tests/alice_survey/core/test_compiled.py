@@ -76,6 +76,13 @@ def test_a_kernel_is_kept_between_processes(folder: Path) -> None:
     assert ask(folder) == (8.0, 1)
 
 
+def test_only_what_python_calls_unpacks_arguments_from_objects(folder: Path) -> None:
+    kept = {path.name.partition("-")[0] for path in (folder / "kept").rglob("*.nbi")}
+    assert kept == {"inner.once", "outer.twice.entry"}
+    inside = "import inner, pickle; kernel = pickle.loads(pickle.dumps(inner.once))"
+    assert ask(folder, f"{inside}; print(kernel(x=3), 0)") == (4.0, 0)
+
+
 def test_a_kernel_is_kept_when_files_change_that_it_does_not_use(folder: Path) -> None:
     (folder / "other.py").write_text("FACTOR = 7.0\n")
     write(folder, above="# more lines\nUNUSED = 3.0\n", doc="Other words.")
