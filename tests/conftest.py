@@ -84,21 +84,28 @@ def shared_data() -> Path:
     return folder
 
 
-@pytest.fixture(scope="session")
-def small_survey() -> Path:
-    """A finished workspace, made once while code and libraries stay; copy it to write into it."""
-    CACHE.mkdir(parents=True, exist_ok=True)
+def _state() -> str:
+    """Digest of all that the small survey depends on."""
     digest = hashlib.blake2b(f"{SMALL}{sys.version}".encode(), digest_size=8)
     for one in sorted(distributions(), key=lambda one: one.name):
         digest.update(f"{one.name} {one.version}".encode())
     for path in sorted(file for name in PACKAGES for file in (ROOT / name).rglob("*.[pt]*")):
         if path.suffix in (".py", ".toml"):
             digest.update(path.read_bytes())
-    folder = CACHE / digest.hexdigest()
+    return digest.hexdigest()
+
+
+@pytest.fixture(scope="session")
+def small_survey() -> Path:
+    """A finished workspace, made once while code and libraries stay; copy it to write into it."""
+    CACHE.mkdir(parents=True, exist_ok=True)
     with FileLock(CACHE / ".lock"):
+        state = _state()
+        folder = CACHE / state
         if not (folder / "done").exists():
             for older in CACHE.iterdir():
                 shutil.rmtree(older, ignore_errors=True)
             assert start(settings_in(folder / "survey"), threads=1).wait() == 0
-            (folder / "done").touch()
+            if _state() == state:  # nobody edited meanwhile
+                (folder / "done").touch()
     return folder / "survey"

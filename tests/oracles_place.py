@@ -1,8 +1,25 @@
-"""Slow, obvious twins of the kernels that weigh correlated errors."""
+"""Slow, obvious twins of the kernels that weigh correlated errors, and how large errors may be."""
 
 import numpy as np
+from scipy.stats import chi2
 
 from alice_survey.core.frames import Array
+
+
+def is_unit(ratios: object, count: int, freedom: float = np.inf) -> bool:
+    """Whether errors over their sigmas are as large as stated, by their root mean square.
+
+    Its square has a chi-squared distribution, outside of these quantiles once in 10,000.
+
+    Args:
+        ratios: errors over sigmas, of any shape.
+        count: number of independent ones.
+        freedom: degrees of freedom that each sigma was estimated with: then the mean square of the
+            ratios is freedom / (freedom - 2).
+    """
+    low, high = chi2.ppf(np.array([5e-5, 1.0 - 5e-5]), count) / count
+    wider = 1.0 if np.isinf(freedom) else freedom / (freedom - 2.0)
+    return bool(low < np.mean(np.square(np.asarray(ratios))) < high * wider)
 
 
 def covariance_matrix(time: Array, sigma: Array, tau: float, white: float) -> Array:

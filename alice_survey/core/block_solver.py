@@ -21,6 +21,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import bsr_matrix, csc_matrix
 from scipy.sparse.linalg import splu
 
+from alice_survey.core.compiled import compiled_ieee
 from alice_survey.core.errors import AliceError
 from alice_survey.core.frames import Array
 
@@ -262,6 +263,36 @@ def inverse_of(matrix: Array) -> Array:
     weight = np.outer(scale, scale)
     inverse: Array = np.linalg.inv(matrix * weight) * weight
     return 0.5 * (inverse + inverse.T)
+
+
+@compiled_ieee
+def solve_symmetric(matrix: Array, right: Array) -> Array:
+    """Solve a positive definite system (N, N) for right sides (N, M) by Cholesky's factors.
+
+    Only the lower triangle is read; what has no solution is NaN. numpy's solvers start threads that
+    wait for each other: on a busy machine these small systems then take a hundred times as long,
+    and their last digits depend on the number of threads.
+    """
+    count, sides = matrix.shape[0], right.shape[1]
+    lower, found = np.empty((count, count)), np.empty((count, sides))
+    for i in range(count):
+        for j in range(i + 1):
+            total = matrix[i, j]
+            for k in range(j):
+                total -= lower[i, k] * lower[j, k]
+            lower[i, j] = math.sqrt(total) if i == j else total / lower[j, j]
+    for m in range(sides):
+        for i in range(count):
+            total = right[i, m]
+            for k in range(i):
+                total -= lower[i, k] * found[k, m]
+            found[i, m] = total / lower[i, i]
+        for i in range(count - 1, -1, -1):
+            total = found[i, m]
+            for k in range(i + 1, count):
+                total -= lower[k, i] * found[k, m]
+            found[i, m] = total / lower[i, i]
+    return found
 
 
 def _factor(matrix: csc_matrix, order: str) -> Any:

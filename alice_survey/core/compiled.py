@@ -10,14 +10,18 @@ enough for a package that is installed and not edited.
 import hashlib
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
+from functools import cached_property
 from pathlib import Path
-from types import CodeType, ModuleType
+from types import CodeType, FunctionType, ModuleType, SimpleNamespace
 from typing import Any, ParamSpec, TypeVar, cast, overload
 
 import numpy as np
 from filelock import Timeout
 from numba import njit
+from numba.core.codegen import ll
+from numba.core.compiler import Compiler, CompileResult
 from numba.core.compiler_lock import global_compiler_lock
+from numba.core.registry import CPUDispatcher
 
 from alice_survey.core.errors import note
 from alice_survey.core.run.resources import user_lock
@@ -49,16 +53,119 @@ def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
         # A copy of such a kernel in the code of its caller may round in another way than its own
         # code, and whichever is loaded first is called: results would depend on what was compiled
         # before. What is inlined is always that of the caller.
-        rounding = {"forceinline": True} if options.get("fastmath") else {}
-        kernel = njit(cache=True, **rounding, **options)(plain)
-        index: Any = getattr(getattr(kernel, "_cache", None), "_cache_file", None)
-        if hasattr(index, "_source_stamp"):
-            index._source_stamp = _Stamp(kernel)
-            index._load_index = _readable(index._load_index)
-            kernel.compile = _once_a_machine(kernel)
+        if options.get("fastmath"):
+            return _compile_and_keep(plain, {"forceinline": True, **options})
+        kernel = _compile_and_keep(plain, {**options, **_INNER})
+        if isinstance(kernel, CPUDispatcher):
+            kernel.__class__ = _Kernel
+            kernel._cache._impl.rebuild = _load_inner
         return kernel
 
     return decorate if function is None else decorate(function)
+
+
+def _compile_and_keep(plain: Callable[..., Any], options: dict[str, Any]) -> Any:
+    """Compile a function, and keep the result on disk as long as its call closure is the same."""
+    kernel = njit(cache=True, **options)(plain)
+    index: Any = getattr(getattr(kernel, "_cache", None), "_cache_file", None)
+    if hasattr(index, "_source_stamp"):
+        index._source_stamp = _Stamp(kernel)
+        index._load_index = _readable(index._load_index)
+        kernel.compile = _once_a_machine(kernel)
+    return kernel
+
+
+class _InnerCompiler(Compiler):  # type: ignore[misc]
+    """Compiles a kernel for its callers alone, within which an entry makes machine code of it."""
+
+    def __init__(self, typing: Any, target: Any, library: Any, *settings: Any) -> None:
+        inner = target.subtarget(get_executable=_name_version)
+        super().__init__(typing, inner, _code_to_link(target), *settings)
+
+
+def _name_version(library: Any, description: Any, environment: Any) -> object:
+    """What numba knows a version of a kernel by, in the place of its machine code."""
+    return object()
+
+
+def _code_to_link(target: Any) -> Any:
+    """Code of a kernel that is kept as it was written, for its callers to link and to optimise."""
+    code = target.codegen().create_library("kernel")
+    code.enable_object_caching()
+
+    def finalize() -> None:
+        code._finalize_dynamic_globals()
+        code._finalized = True
+
+    code._optimize_final_module, code._finalize_final_module = lambda: None, finalize
+    code.serialize_using_object_code = code.serialize_using_bitcode
+    return code
+
+
+def _load_inner(target: Any, kept: Any) -> Any:
+    """A kernel that is kept for its callers."""
+    (_, _, bitcode), *values, environments = kept
+    code = _code_to_link(target)
+    code._final_module, code._environments = ll.parse_bitcode(bitcode), environments
+    code._finalize_final_module()
+    inner = target.subtarget(get_executable=_name_version)
+    inner.codegen = lambda: SimpleNamespace(unserialize_library=lambda _: code)
+    return CompileResult._rebuild(inner, bitcode, *values, ())._replace(target_context=target)
+
+
+class _Kernel(CPUDispatcher):  # type: ignore[misc]
+    """A kernel as other kernels call it; Python calls `entry`, compiled when it does so.
+
+    The code that unpacks arguments from Python objects is longer than most kernels: only those
+    have it that are called from there.
+    """
+
+    def add_overload(self, result: Any) -> None:
+        self.overloads[tuple(result.signature.args)] = result  # not where Python looks
+
+    @cached_property
+    def entry(self) -> Any:
+        """The same kernel with that code."""
+        plain = self.py_func
+        outer = FunctionType(
+            plain.__code__, plain.__globals__, plain.__name__, plain.__defaults__, plain.__closure__
+        )
+        outer.__kwdefaults__, outer.__module__ = plain.__kwdefaults__, plain.__module__
+        outer.__qualname__ = f"{plain.__qualname__}.entry"
+        options = self.targetoptions.items()
+        return _compile_and_keep(
+            outer, {key: value for key, value in options if key not in _NOT_OF_ENTRY}
+        )
+
+    @property
+    def stats(self) -> Any:
+        """What was loaded and compiled, for Python and for other kernels."""
+        own, calls = super().stats, self.entry.stats
+        return calls._replace(
+            cache_hits=own.cache_hits + calls.cache_hits,
+            cache_misses=own.cache_misses + calls.cache_misses,
+        )
+
+    def _compile_for_args(self, *args: Any, **named: Any) -> Any:
+        called = self.entry._compile_for_args(*args, **named)
+        for kinds, version in self.entry.overloads.items():
+            if kinds not in self._inserted:
+                self._inserted.add(kinds)
+                for environment in version._find_referenced_environments():  # of inner kernels
+                    version.codegen.set_env(environment.env_name, environment)
+                self._insert([kind._code for kind in kinds], version.entry_point, False)
+        return called
+
+    @cached_property
+    def _inserted(self) -> set[tuple[Any, ...]]:
+        """Types of arguments with which Python calls the entry at once from now on."""
+        return set()
+
+
+_INNER: dict[str, Any] = {
+    "no_cpython_wrapper": True, "no_cfunc_wrapper": True, "pipeline_class": _InnerCompiler,
+}  # fmt: skip
+_NOT_OF_ENTRY = {*_INNER, "nopython", "boundscheck"}
 
 
 def compiled_ieee(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
@@ -76,7 +183,7 @@ def kernel(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Res
     Without numba's runtime a function that would allocate an array does not compile, and none
     spends time on counting references: equations of motion run seven times as fast.
     """
-    kept: Callable[_Arguments, _Result] = compiled(_nrt=False)(function)
+    kept: Callable[_Arguments, _Result] = compiled(_nrt=False, error_model="numpy")(function)
     return kept
 
 

@@ -148,12 +148,10 @@ def _bend(inner: float, outer: float, reach: float, n_glass: float, n_water: flo
 
 
 @compiled_ieee
-def _turn(sin: float, cos: float, of: float, more: bool) -> tuple[float, float, float]:
-    """Sine and cosine of an angle plus or minus asin(of), and the cosine of that."""
+def _turn(sin: float, cos: float, of: float) -> tuple[float, float, float]:
+    """Sine and cosine of an angle plus asin(of), and the cosine of that."""
     side = math.sqrt(1.0 - of * of)
-    if more:
-        return sin * side + cos * of, cos * side - sin * of, side
-    return sin * side - cos * of, cos * side + sin * of, side
+    return sin * side + cos * of, cos * side - sin * of, side
 
 
 @compiled_ieee
@@ -174,11 +172,11 @@ def _step(
     by_a, by_c = 1.0 / (port[3] - port[4]), 1.0 / (port[5] * port[3])
     by_b, by_d = by_a / port[5], 1.0 / (port[6] * port[3])
     by_e = 1.0 / (port[6] * reach)
-    s, k, cos_a = _turn(sin, cos, h * by_a, False)
-    s, k, cos_b = _turn(s, k, h * by_b, True)
-    s, k, cos_c = _turn(s, k, h * by_c, False)
-    s, k, cos_d = _turn(s, k, h * by_d, True)
-    s, k, cos_e = _turn(s, k, h * by_e, False)
+    s, k, cos_a = _turn(sin, cos, -h * by_a)
+    s, k, cos_b = _turn(s, k, h * by_b)
+    s, k, cos_c = _turn(s, k, -h * by_c)
+    s, k, cos_d = _turn(s, k, h * by_d)
+    s, k, cos_e = _turn(s, k, -h * by_e)
     bend = by_b / cos_b - by_a / cos_a + by_d / cos_d - by_c / cos_c - by_e / cos_e
     return s, 1.0 + bend * (along * cos + aside * sin)
 

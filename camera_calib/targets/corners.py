@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from alice_survey.core.block_solver import solve_symmetric
 from alice_survey.core.compiled import compiled
 from alice_survey.core.frames import Array
 from camera_calib.targets.pattern import CROSSING, Surroundings
@@ -223,7 +224,8 @@ def _fit_corners(
     out, states = np.full((near.shape[0], 4), np.nan), np.zeros(near.shape[0], np.intp)
     side = 2 * _HALF_PX + 1
     window, used = np.empty((side, side)), np.empty((side, side), np.bool_)
-    places = np.empty((side, side, 2))
+    places, first_two = np.empty((side, side, 2)), np.zeros((9, 2))
+    first_two[0, 0] = first_two[1, 1] = 1.0
     for i in range(near.shape[0]):
         column, row = int(near[i, 0]), int(near[i, 1])
         states[i] = _cut(picture, near[i], bends[i], windows[i], window, used, places)
@@ -237,23 +239,23 @@ def _fit_corners(
         )
         shade = shades[which[i], top : bottom + 1, left : right + 1]
         x, y = near[i, 0] - column, near[i, 1] - row
-        best, cost, normal = _descend(window, used, places, edges, shade, x, y, steps[i])
-        count = used.sum()
+        best, variance, normal = _descend(window, used, places, edges, shade, x, y, steps[i])
         area = abs(steps[i, 0, 0] * steps[i, 1, 1] - steps[i, 0, 1] * steps[i, 1, 0])
         farthest = max(_MAX_PX, _MAX_SHIFT * math.sqrt(area))
         settled = math.hypot(best[0] - x, best[1] - y) < farthest
         if not settled or not _NARROWEST_PX < best[4] < _WIDEST_PX:
             states[i] = NOT_SETTLED
             continue
-        variance = cost / (count - 9)
         contrast2 = best[5] * best[5]
         allowed = min(_WORST_MISFIT**2 * contrast2 + noise, _WORST_NOISY_MISFIT**2 * contrast2)
         if abs(best[5]) < _MIN_CONTRAST or variance > allowed:
             states[i] = UNLIKE_A_CORNER
             continue
-        inverse = np.linalg.inv(normal + 1e-12 * np.eye(9))
+        for k in range(9):
+            normal[k, k] += 1e-12
+        inverse = solve_symmetric(normal, first_two)
         sigma = math.sqrt(0.5 * (inverse[0, 0] + inverse[1, 1]) * variance * _WHITE_NOISE)
-        if sigma > _MAX_SIGMA_PX:
+        if not sigma <= _MAX_SIGMA_PX:
             states[i] = UNLIKE_A_CORNER
             continue
         out[i, 0], out[i, 1] = column + best[0], row + best[1]
@@ -314,7 +316,7 @@ def _descend(
     y: float,
     steps: Array,
 ) -> tuple[Array, float, Array]:
-    """Levenberg-Marquardt from a start; returns what fits, the cost and the normal matrix.
+    """Levenberg-Marquardt from a start; returns what fits, its variance and the normal matrix.
 
     What fits are the centre, normals of both edges, blur, contrast, level and its two slopes.
     """
@@ -326,7 +328,9 @@ def _descend(
                 total += window[j, i]
                 count += 1
     one, two = math.atan2(steps[0, 0], -steps[1, 0]), math.atan2(-steps[0, 1], steps[1, 1])
-    q = np.array([x, y, one, two, 1.5, 0.5 * (high - low), total / count, 0.0, 0.0])
+    q, damped = np.zeros(9), np.empty((9, 9))
+    q[0], q[1], q[2], q[3] = x, y, one, two
+    q[4], q[5], q[6] = 1.5, 0.5 * (high - low), total / count
     damping = 1e-3
     cost = _equations(window, used, places, edges, shades, q)[0]
     q[5] = -q[5]
@@ -334,14 +338,17 @@ def _descend(
         q[5] = -q[5]
     cost, normal, right = _equations(window, used, places, edges, shades, q)
     for _ in range(_STEPS):
-        damped = normal.copy()
-        for k in range(9):
-            damped[k, k] += damping * normal[k, k] + 1e-12
-        step = np.linalg.solve(damped, right)
-        tried = q - step
+        for a in range(9):
+            for b in range(a + 1):
+                damped[a, b] = normal[a, b]
+            damped[a, a] += damping * normal[a, a] + 1e-12
+        step = solve_symmetric(damped, right)
+        tried = np.empty(9)
+        for a in range(9):
+            tried[a] = q[a] - step[a, 0]
         new_cost, new_normal, new_right = _equations(window, used, places, edges, shades, tried)
         if new_cost < cost:
-            small = abs(step[0]) + abs(step[1]) < 1e-6
+            small = abs(step[0, 0]) + abs(step[1, 0]) < 1e-6
             q, cost, normal, right = tried, new_cost, new_normal, new_right
             damping *= 0.2
             if small:
@@ -350,7 +357,7 @@ def _descend(
             damping *= 5.0
             if damping > 1e8:
                 break
-    return q, cost, normal
+    return q, cost / (count - 9), normal
 
 
 @compiled
@@ -390,7 +397,7 @@ def _equations(
     q: Array,
 ) -> tuple[float, Array, Array]:
     """Sum of squared residuals, and the normal equations."""
-    cost, normal, right = 0.0, np.zeros((9, 9)), np.zeros(9)
+    cost, normal, right = 0.0, np.zeros((9, 9)), np.zeros((9, 1))
     slope = np.empty(9)
     down_edges, along_edges = edges
     high, wide = len(down_edges), len(along_edges)
@@ -436,7 +443,7 @@ def _equations(
             miss = q[6] + q[7] * across + q[8] * down + q[5] * value - window[j, i]
             cost += miss * miss
             for a in range(9):
-                right[a] += slope[a] * miss
+                right[a, 0] += slope[a] * miss
                 for b in range(a, 9):
                     normal[a, b] += slope[a] * slope[b]
     for a in range(9):

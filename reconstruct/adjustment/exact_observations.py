@@ -205,10 +205,8 @@ def exact_observations(
             at, by_cam, by_camera = camera.project_jacobian(turned + pose.translation)
             slopes = select_slopes(source, by_camera, by_cam, turned)
             miss = (at - pixels.taken[rows])[:, :, None]
-            _put(
-                rows, by_cam @ turn, world_from_rig, np.concatenate([slopes, miss], axis=2),
-                target, by_point, rest,
-            )  # fmt: skip
+            slopes = np.ascontiguousarray(np.concatenate([slopes, miss], axis=2))
+            _put(rows, by_cam @ turn, world_from_rig, slopes, target, by_point, rest)
     return LinearObservations(
         starts=pixels.starts, station=pixels.station, by_point=by_point, arm=arm, rest=rest
     )

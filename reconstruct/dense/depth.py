@@ -156,13 +156,15 @@ def depth_in_reference(
     Returns:
         (H, W) depth, NaN where any of the four virtual pixels around is unknown.
     """
+    rect_from_partner = _FROM_CORNER @ rectification.rect_from_partner
     depth: NDArray[np.float32] = triangulate(
         disparity_px,
         reference.pinhole.size_px[::-1],
         reference.kernel_lens,
         partner.kernel_lens,
         _FROM_CORNER @ rectification.rect_from_reference,
-        _FROM_CORNER @ rectification.rect_from_partner,
+        rect_from_partner,
+        np.linalg.inv(rect_from_partner),
         rectification.cosines,
         rectification.focal_px * rectification.baseline,
         rectification.disparity_offset_px,
@@ -178,6 +180,7 @@ def triangulate(
     partner: KernelLens,
     rect_from_reference: Array,
     rect_from_partner: Array,
+    partner_from_rect: Array,
     cosines: Array,
     focal_baseline: float,
     offset_px: float,
@@ -195,6 +198,7 @@ def triangulate(
         partner: its lens.
         rect_from_reference: (3, 3) from the model's pixels to the virtual picture's array indices.
         rect_from_partner: (3, 3) rotation of the partner.
+        partner_from_rect: its inverse.
         cosines: as in `Rectification`.
         focal_baseline: of the virtual pictures.
         offset_px: of the disparity.
@@ -205,9 +209,7 @@ def triangulate(
     rows, columns = disparity_px.shape
     height, width = shape
     depth = np.full(shape, np.nan, np.float32)
-    h, g = rect_from_reference, rect_from_partner
-    back = np.linalg.inv(g)
-    c = cosines
+    h, g, back, c = rect_from_reference, rect_from_partner, partner_from_rect, cosines
     pinhole, other = reference[0], partner[0]
     near, far = reference[2], partner[2]
     for row in range(height):

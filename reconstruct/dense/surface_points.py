@@ -88,7 +88,10 @@ def surfaces_of(
     """
     count = heights.size
     surface = np.zeros(count, np.int64)
-    if heights.max() - heights.min() <= cell:
+    low, high = heights[0], heights[0]
+    for height in heights:
+        low, high = min(low, height), max(high, height)
+    if high - low <= cell:
         return 1, surface
     ranks = sorted_ranks(heights)
     starts = np.empty(count + 1, np.int64)  # of parts, in the order of heights

@@ -294,7 +294,7 @@ def check_view(sigma_factor: float, task: ViewTask) -> tuple[Array, int]:
     alike = np.asarray(store.load(task.index, "seen")).astype(np.int16)
     refuted = np.zeros_like(alike)
     supported = np.zeros_like(alike)
-    slopes = slopes_of(depth, view.kernel_lens)
+    slopes = slopes_of(depth, view.kernel_lens, 0, 0)
     for number, other in task.others:
         move = (other.world_from_cam.inv() * view.world_from_cam).as_matrix()[:3]
         there = np.ascontiguousarray(move), store.stored_depth(number, "fine")

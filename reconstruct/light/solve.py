@@ -33,6 +33,7 @@ from scipy.sparse import csc_array, csr_array, diags_array
 from scipy.sparse.linalg import splu
 
 from alice_survey.core.artefacts import read_json, write_json
+from alice_survey.core.block_solver import solve_symmetric
 from alice_survey.core.compiled import compiled
 from alice_survey.core.contents import taken_from
 from alice_survey.core.executor import SERIAL, Executor
@@ -648,34 +649,4 @@ def _sums_of_part(e: LightEquations, solution: Array) -> list[tuple[csr_array, A
         weight = 1.0 / (np.maximum(rest, misfit) * misfit * SAMPLES_PER_FACT)
         weighted = (diags_array(weight) @ e.matrix).T
         found.append(((weighted @ e.matrix).tocsr(), weighted @ target))
-    return found
-
-
-# numpy's solvers start threads that wait for each other: on a busy machine these small systems then
-# take a hundred times as long, and their last digits depend on the number of threads
-
-
-@compiled
-def solve_symmetric(matrix: Array, right: Array) -> Array:
-    """Solve a positive definite system (N, N) for right sides (N, M) by Cholesky's factors."""
-    count = len(matrix)
-    lower = np.zeros_like(matrix)
-    found = right.copy()
-    for i in range(count):
-        for j in range(i + 1):
-            total = matrix[i, j]
-            for k in range(j):
-                total -= lower[i, k] * lower[j, k]
-            lower[i, j] = np.sqrt(total) if i == j else total / lower[j, j]
-    for m in range(right.shape[1]):
-        for i in range(count):
-            total = found[i, m]
-            for k in range(i):
-                total -= lower[i, k] * found[k, m]
-            found[i, m] = total / lower[i, i]
-        for i in range(count - 1, -1, -1):
-            total = found[i, m]
-            for k in range(i + 1, count):
-                total -= lower[k, i] * found[k, m]
-            found[i, m] = total / lower[i, i]
     return found

@@ -30,6 +30,7 @@ from scipy.linalg import block_diag
 from scipy.sparse import block_array, csr_array, diags_array
 from scipy.sparse.linalg import splu
 
+from alice_survey.core.block_solver import solve_symmetric
 from alice_survey.core.frames import Array
 from alice_survey.core.run import progress
 from reconstruct.light.solve import (
@@ -40,7 +41,6 @@ from reconstruct.light.solve import (
     around_zero,
     bending,
     node_weights,
-    solve_symmetric,
 )
 
 MIN_LEFT = np.float32(0.05)

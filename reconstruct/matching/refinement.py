@@ -21,6 +21,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
+from alice_survey.core.block_solver import solve_symmetric
 from alice_survey.core.compiled import compiled
 from alice_survey.core.executor import Executor
 from alice_survey.core.frames import Array
@@ -344,7 +345,7 @@ def _compare(
         total = 0.0
         for k in range(len(seen)):
             total += weighted[n, k] * (seen[k] - levels[k])
-        right[n] = total
+        right[n, 0] = total
     total = sum_a = sum_b = sum_aa = sum_bb = sum_ab = 0.0
     for k in range(len(seen)):
         weight, a, b = weights[k], levels[k], seen[k]
@@ -368,8 +369,8 @@ def _align(first: Any, second: Any, reference: Any, pixels: Any, affine: Any) ->
         u, v = k % side - _RADIUS, k // side - _RADIUS
         weights[k] = math.exp(-0.5 * (u * u + v * v) / (_SIGMA * _SIGMA))
     slopes, weighted = np.empty((_UNKNOWNS, count)), np.empty((_UNKNOWNS, count))
-    square, right = np.empty((_UNKNOWNS, _UNKNOWNS)), np.empty(_UNKNOWNS)
-    m = np.empty((2, 2))
+    square, right = np.empty((_UNKNOWNS, _UNKNOWNS)), np.empty((_UNKNOWNS, 1))
+    m, step = np.empty((2, 2)), np.empty(6)
     found = np.full(pixels.shape, np.nan)
     for point in range(len(pixels)):
         x, y = reference[point, 0] - 0.5, reference[point, 1] - 0.5
@@ -377,19 +378,20 @@ def _align(first: Any, second: Any, reference: Any, pixels: Any, affine: Any) ->
             continue
         _template(first, x, y, patch, levels, slopes)
         _weighted_sum(weights, slopes, weighted, square)
-        inverse = np.linalg.inv(square)
         x, y = pixels[point, 0] - 0.5, pixels[point, 1] - 0.5
-        m[:] = affine[point]
+        for axis in range(2):
+            m[axis, 0], m[axis, 1] = affine[point, axis, 0], affine[point, axis, 1]
         settled = False
         for _ in range(_STEPS):
             correlation = _compare(second, x, y, m, weights, levels, weighted, seen, right)
             if correlation < -1.5:
                 break
-            step = inverse @ right
-            gain = 1.0 + step[6]
+            solved = solve_symmetric(square, right)
+            gain = 1.0 + solved[6, 0]
             if not gain > 0.1:
                 break
-            step[:6] /= gain
+            for k in range(6):
+                step[k] = solved[k, 0] / gain
             # the second picture shows the reference moved by `step`: undo that in the warp
             a, b, c, d = 1.0 + step[2], step[3], step[4], 1.0 + step[5]
             area = a * d - b * c

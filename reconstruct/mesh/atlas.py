@@ -146,7 +146,7 @@ def pack(boxes: NDArray[np.int64], side: int) -> NDArray[np.int64]:
 def _fill_page(boxes: NDArray[np.int64], side: int) -> NDArray[np.int64]:
     """Corners (C, 2) of boxes (C, 2), taken in their order; -1 of those that do not fit."""
     corner = np.full(boxes.shape, -1, np.int64)
-    skyline, steps = np.zeros((min(side, 2 * len(boxes)) + 3, 2), np.int64), 1
+    skyline, steps = np.zeros((min(side, 2 * len(boxes)) + 3, 2), np.int64), int(np.int64(1))
     for box in range(len(boxes)):
         width, height = boxes[box, 0], boxes[box, 1]
         x, y = _lowest(skyline[:steps], width, side)
@@ -184,7 +184,11 @@ def _raise(skyline: NDArray[np.int64], steps: int, west: int, east: int, level: 
     while last < steps and skyline[last, 0] <= east:
         under = skyline[last, 1]
         last += 1
-    skyline[first + 2 : first + 2 + steps - last] = skyline[last:steps].copy()
+    moved = steps - last
+    for k in range(moved):
+        step = moved - 1 - k if first + 2 > last else k  # none is written before it is read
+        skyline[first + 2 + step, 0] = skyline[last + step, 0]
+        skyline[first + 2 + step, 1] = skyline[last + step, 1]
     skyline[first, 0], skyline[first, 1] = west, level
     skyline[first + 1, 0], skyline[first + 1, 1] = east, under
-    return first + 2 + steps - last
+    return first + 2 + moved

@@ -223,7 +223,8 @@ def _turns_or_thins(
             continue
         before = _normal(place[face[0]], place[face[1]], place[face[2]], old)
         for k in range(3):
-            corner[k] = target_place if face[k] == moving else place[face[k]]
+            for axis in range(3):
+                corner[k, axis] = target_place[axis] if face[k] == moving else place[face[k], axis]
         after = _normal(corner[0], corner[1], corner[2], new)
         dot = old[0] * new[0] + old[1] * new[1] + old[2] * new[2]
         if not dot > _MIN_COSINE * before * after:
@@ -287,7 +288,8 @@ def _collapse(
             for k in range(3):
                 if faces[face, k] == b:
                     faces[face, k] = a
-        place[a] = target_place[n]
+        for k in range(3):
+            place[a, k] = target_place[n, k]
         for k in range(11):
             quadrics[a, k] += quadrics[b, k]
         gone += 1

@@ -315,7 +315,8 @@ class GridHeights:
         grid = self.grid.window(
             rows.start, columns.start, rows.stop - rows.start, columns.stop - columns.start
         )
-        return replace(self, grid=grid, height=self.height[rows, columns])
+        height = np.ascontiguousarray(self.height[rows, columns])
+        return replace(self, grid=grid, height=height)
 
 
 def visible_over(view: View, dem: Float32, around: DemGrid, stored: Path | None = None) -> Visible:
@@ -429,7 +430,7 @@ def see(
     lens = replace(view, shift=optics.shift).kernel_lens
     found = look_up(
         surface.height,
-        requested,
+        (np.ascontiguousarray(requested[0]), requested[1]),
         visible.cells,
         ((visible.north - north) / cell - 0.5, (east - visible.west) / cell - 0.5),
         grid.cell / cell,

@@ -102,8 +102,9 @@ def standard_residuals(
     Returns:
         (N,), meaningless where not used.
     """
-    past, past_variance = whiten(time, sigma, used, values[:, None], tau, white)[2:]
-    reversed_ = (np.ascontiguousarray(row[::-1]) for row in (time, sigma, used, values[:, None]))
+    rows = time, sigma, np.ascontiguousarray(used), values[:, None]
+    past, past_variance = whiten(*rows, tau, white)[2:]
+    reversed_ = (np.ascontiguousarray(row[::-1]) for row in rows)
     future, future_variance = (row[::-1] for row in whiten(*reversed_, tau, white)[2:])
     past, future = past[:, 0], future[:, 0]
     precision = 1.0 / past_variance + 1.0 / future_variance - 1.0
@@ -276,6 +277,7 @@ class PlacementProblem:
     ) -> tuple[Array, float]:
         """Columns (M, C) over the stated sigma, made white; log det of what is used."""
         columns = np.where(rows[:, None], columns / varying[:, None], 0.0)
+        rows, columns = np.ascontiguousarray(rows), np.ascontiguousarray(columns)
         sigma = varying * self.found.sigma[:, channel]
         return whiten(self.times(how), sigma, rows, columns, how.tau, how.white)[:2]
 

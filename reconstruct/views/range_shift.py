@@ -216,7 +216,7 @@ def line_of(
 
 @compiled(error_model="numpy", fastmath=FAST)
 def slopes_of(
-    depth: NDArray[np.float32], lens: KernelLens, top: int = 0, left: int = 0
+    depth: NDArray[np.float32], lens: KernelLens, top: int, left: int
 ) -> NDArray[np.float32]:
     """Slopes x/z, y/z (H, W, 2) of the spots that a warped picture shows; NaN without depth.
 

@@ -211,6 +211,7 @@ artefacts.run_stage(target, made, lambda folder: (folder / "result.txt").write_t
 """
 
 
+@pytest.mark.slow
 def test_a_kill_at_any_step_loses_nothing(tmp_path: Path) -> None:
     """Whatever call the kill falls on, the next run ends with the right, whole stage."""
     killed = 0

@@ -11,15 +11,8 @@ from alice_survey.core.frames import Array
 from camera_calib.camera import Camera, pose_jacobian
 from camera_calib.lenses.opencv import OpenCVLens
 from camera_calib.ports.flat import FlatPort
+from tests import oracles_camera
 from tests.cameras import MANTA, changed
-from tests.oracles_camera import (
-    assert_slopes,
-    assert_slopes_by_point,
-    lens_pixel,
-    numeric_slope,
-    project_by_bisection,
-    project_by_shortest_path,
-)
 
 PARAMETERS = (*OpenCVLens.parameters, *FlatPort.parameters)
 
@@ -77,7 +70,7 @@ def test_project_agrees_with_the_shortest_optical_path(
         camera = changed(camera, glass_thickness_m=1e-6)
 
     np.testing.assert_allclose(
-        camera.project(point), project_by_shortest_path(camera, point), atol=1e-8
+        camera.project(point), oracles_camera.project_by_shortest_path(camera, point), atol=1e-8
     )
 
 
@@ -99,7 +92,7 @@ def test_project_agrees_with_bisection(
         return
 
     np.testing.assert_allclose(
-        camera.project(point), project_by_bisection(camera, point), atol=1e-8
+        camera.project(point), oracles_camera.project_by_bisection(camera, point), atol=1e-8
     )
 
 
@@ -121,14 +114,14 @@ STEPS = {
 def test_slopes_are_those_of_project(camera: Camera, points: Array) -> None:
     """By the point also for a port at the pupil and in air; parameters need room for a step."""
     points = np.vstack([points, 1.5 * np.array(camera.port.axis_cam)])
-    assert_slopes_by_point(camera, points)
+    oracles_camera.assert_slopes_by_point(camera, points)
     camera = changed(
         camera,
         port_distance_m=camera.parameter("port_distance_m") + 1e-3,
         glass_thickness_m=camera.parameter("glass_thickness_m") + 1e-3,
         n_water=camera.n_water + 4e-3,
     )
-    assert_slopes(camera, points, STEPS)
+    oracles_camera.assert_slopes(camera, points, STEPS)
 
 
 def test_slopes_by_a_pose_are_those_of_moved_points() -> None:
@@ -141,10 +134,12 @@ def test_slopes_by_a_pose_are_those_of_moved_points() -> None:
     assert slopes.shape == (30, 2, 6)
     for axis in range(3):
         unit = np.eye(3)[axis]
-        turned = numeric_slope(
+        turned = oracles_camera.numeric_slope(
             lambda h, u=unit: camera.project(Rotation.from_rotvec(h * u).apply(points)), 1e-3
         )
-        shifted = numeric_slope(lambda h, u=unit: camera.project(points + h * u), 1e-3)
+        shifted = oracles_camera.numeric_slope(
+            lambda h, u=unit: camera.project(points + h * u), 1e-3
+        )
         np.testing.assert_allclose(slopes[..., axis], turned, rtol=1e-6, atol=1e-4)
         np.testing.assert_allclose(slopes[..., 3 + axis], shifted, rtol=1e-6, atol=1e-4)
 
@@ -192,7 +187,7 @@ def test_without_port_and_water_it_is_opencvs_camera() -> None:
     camera = changed(MANTA, k1=-0.1, k2=0.05, p1=1e-3, p2=-2e-3, k3=0.01, n_glass=1.0, n_water=1.0)
     points = rng.uniform([-1, -1, 2], [1, 1, 4], (200, 3))
 
-    expected = [lens_pixel(camera, point) for point in points]
+    expected = [oracles_camera.lens_pixel(camera, point) for point in points]
 
     np.testing.assert_allclose(camera.project(points), expected, atol=1e-9)
 

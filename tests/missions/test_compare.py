@@ -184,6 +184,7 @@ def test_any_vehicles_are_compared(tmp_path: Path) -> None:
         compare.variants_of(["nautilus"])
 
 
+@pytest.mark.slow
 def test_the_command_prints_what_it_writes(tmp_path: Path) -> None:
     text = (
         "[area]\nlength_m = 3.0\nwidth_m = 1.0\nseafloor_depth_m = 6.0\n[plan]\ncross_lines = 0\n"

@@ -17,15 +17,8 @@ from alice_survey.core.errors import PlanError, VehicleError
 from alice_survey.core.executor import SERIAL
 from alice_survey.sim.vehicle.pilot.memory import FOLLOW, LEG, PHASE
 from camera_calib.rig import design_rig
+from missions.fly import simulation
 from missions.fly.run import flight_summary
-from missions.fly.simulation import (
-    max_mission_s,
-    one_dive,
-    path_of,
-    room_behind_m,
-    stations_of_dives,
-    whole_route,
-)
 from missions.values.flight import Flight
 from tests.missions.flown_plans import flown, off_stations_m, plan_of, survey, walk
 
@@ -54,7 +47,7 @@ def flight() -> Flight:
 
 
 def test_dives_join_at_home_by_a_turn_on_the_spot() -> None:
-    legs = whole_route(PLAN).legs
+    legs = simulation.whole_route(PLAN).legs
     count = len(FIRST.legs)
     assert legs[:count] == FIRST.legs
     assert legs[count + 1 :] == SECOND.legs
@@ -63,18 +56,18 @@ def test_dives_join_at_home_by_a_turn_on_the_spot() -> None:
     # Home from the east is a course of 270 degrees; the second dive begins at 90.
     assert (between.length_m, between.line) == (0.0, -1)
     assert abs(between.turn_rad) == pytest.approx(math.pi)
-    path = path_of(PLAN)
+    path = simulation.path_of(PLAN)
     assert path.line[path.line >= 0].tolist() == [0.0, 1.0, 2.0]
 
 
 def test_one_dive_is_the_plan_with_that_dive_alone() -> None:
-    second = one_dive(PLAN, 2)
-    assert whole_route(second).legs == SECOND.legs
+    second = simulation.one_dive(PLAN, 2)
+    assert simulation.whole_route(second).legs == SECOND.legs
     assert second.lines == PLAN.lines
-    assert (stations_of_dives(second), stations_of_dives(PLAN)) == (6, 18)
+    assert (simulation.stations_of_dives(second), simulation.stations_of_dives(PLAN)) == (6, 18)
     assert second.duration_s == PLAN.dives[1].duration_s
-    assert max_mission_s(second) < max_mission_s(PLAN)
-    assert one_dive(PLAN, None) is PLAN
+    assert simulation.max_mission_s(second) < simulation.max_mission_s(PLAN)
+    assert simulation.one_dive(PLAN, None) is PLAN
 
 
 def test_all_dives_are_flown_in_one_mission_from_home_to_home(flight: Flight) -> None:
@@ -93,7 +86,7 @@ def test_all_dives_are_flown_in_one_mission_from_home_to_home(flight: Flight) ->
 
 def test_stops_are_made_where_they_are_planned(flight: Flight) -> None:
     """By the navigation: where the vehicle turns on the spot, and how it steps aside."""
-    path, leg = path_of(PLAN), flight.flown.report[:, LEG]
+    path, leg = simulation.path_of(PLAN), flight.flown.report[:, LEG]
     following = flight.flown.report[:, PHASE] == FOLLOW
     for i in np.flatnonzero(path.turn_rad):
         rows = following & (leg == i)
@@ -106,7 +99,7 @@ def test_stops_are_made_where_they_are_planned(flight: Flight) -> None:
 
 
 def test_one_dive_is_flown_alone() -> None:
-    alone = flown(one_dive(PLAN, 2), survey())
+    alone = flown(simulation.one_dive(PLAN, 2), survey())
     assert alone.ending == "complete"
     assert set(alone.trigger_line) == {2}
     assert np.flatnonzero(~np.isnan(alone.line_errors[0])).size > 100
@@ -126,7 +119,9 @@ def test_one_dive_is_flown_alone() -> None:
 )
 def test_the_way_in_stays_where_the_vehicle_may_be(allowed: Polygon, room: float) -> None:
     fenced = replace(PLAN, area=replace(PLAN.area, allowed=MultiPolygon([allowed])))
-    assert room_behind_m(fenced, path_of(fenced), 1.6) == pytest.approx(room, abs=1e-5)
+    assert simulation.room_behind_m(fenced, simulation.path_of(fenced), 1.6) == pytest.approx(
+        room, abs=1e-5
+    )
 
 
 def test_a_vehicle_without_sway_turns_on_the_spot_with_a_warning_but_cannot_step(
@@ -136,7 +131,7 @@ def test_a_vehicle_without_sway_turns_on_the_spot_with_a_warning_but_cannot_step
     with pytest.raises(VehicleError, match="1 sway step"):
         flown(PLAN, config)
     capsys.readouterr()
-    flight = flown(one_dive(PLAN, 2), config)
+    flight = flown(simulation.one_dive(PLAN, 2), config)
     assert capsys.readouterr().err
     assert flight.ending == "complete"
     assert len(flight.trigger_s) == 6

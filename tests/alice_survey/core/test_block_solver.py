@@ -7,7 +7,14 @@ import pytest
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from alice_survey.core.block_solver import BlockStep, Equations, Minimum, inverse_of, minimise
+from alice_survey.core.block_solver import (
+    BlockStep,
+    Equations,
+    Minimum,
+    inverse_of,
+    minimise,
+    solve_symmetric,
+)
 from alice_survey.core.errors import AliceError
 from alice_survey.core.frames import Array
 from tests.oracles_refraction import dense_of
@@ -188,3 +195,13 @@ def test_too_few_steps_are_not_settled() -> None:
     found = minimise(curves(1.2), np.append(np.ones(8), 3.0), settled=1e-7, max_steps=2)
     assert not found.is_settled
     assert not found.is_stuck
+
+
+@pytest.mark.parametrize("size", [1, 9, 40])
+def test_a_small_system_is_solved_as_by_numpy_and_unknown_without_a_solution(size: int) -> None:
+    rng = np.random.default_rng(size)
+    slopes, right = rng.normal(size=(2 * size, size)), rng.normal(size=(size, 2))
+    matrix = slopes.T @ slopes
+    found = solve_symmetric(np.tril(matrix), right)
+    np.testing.assert_allclose(found, np.linalg.solve(matrix, right), rtol=1e-9, atol=1e-12)
+    assert np.isnan(solve_symmetric(-matrix, right)).all()

@@ -1,6 +1,8 @@
 """Compiled kernels are kept between processes, and dropped when what they are made of changes."""
 
+import ast
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -12,6 +14,7 @@ from numba import njit
 from numba.core.errors import TypingError
 
 from alice_survey.core.compiled import closure_digest, kernel
+from tests import structure
 
 ASK = "import inner, outer; print(outer.twice(3.0), sum(outer.twice.stats.cache_hits.values()))"
 INNER = '''
@@ -71,6 +74,13 @@ def ask(folder: Path, code: str = ASK) -> tuple[float, int]:
 
 def test_a_kernel_is_kept_between_processes(folder: Path) -> None:
     assert ask(folder) == (8.0, 1)
+
+
+def test_only_what_python_calls_unpacks_arguments_from_objects(folder: Path) -> None:
+    kept = {path.name.partition("-")[0] for path in (folder / "kept").rglob("*.nbi")}
+    assert kept == {"inner.once", "outer.twice.entry"}
+    inside = "import inner, pickle; kernel = pickle.loads(pickle.dumps(inner.once))"
+    assert ask(folder, f"{inside}; print(kernel(x=3), 0)") == (4.0, 0)
 
 
 def test_a_kernel_is_kept_when_files_change_that_it_does_not_use(folder: Path) -> None:
@@ -173,3 +183,17 @@ def test_a_kernel_cannot_allocate() -> None:
 
     with pytest.raises(TypingError):
         kernel(allocates)(1.0)
+
+
+def test_kernels_leave_numpys_library_alone() -> None:
+    """numba compiles solvers, sorts and differences again for each kernel that calls them."""
+    slow = re.compile(r"np\.(linalg\.\w+|diff|unique|argsort|sort|flatnonzero|take)$")
+    found = []
+    for package in structure.PACKAGES:
+        for path in (structure.ROOT / package).rglob("*.py"):
+            for part in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                marks = getattr(part, "decorator_list", ())
+                if any(re.match(r"compiled|kernel", ast.unparse(mark)) for mark in marks):
+                    calls = (ast.unparse(n.func) for n in ast.walk(part) if isinstance(n, ast.Call))
+                    found += [f"{path}: {call}" for call in calls if slow.match(call)]
+    assert not found

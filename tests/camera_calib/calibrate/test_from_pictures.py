@@ -323,6 +323,7 @@ def test_pictures_of_other_moments_are_no_calibration(dry: Path, tmp_path: Path)
     assert "of the 12 views of both" in refuses(settings, tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick")
 def test_a_camera_of_which_most_pictures_do_not_fit_is_no_calibration(
     dry: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -14,14 +14,7 @@ from camera_calib.formats.opencv import read_opencv, write_opencv
 from camera_calib.formats.rigs import ReadOptions
 from camera_calib.lenses.fisheye import FisheyeLens
 from camera_calib.rig import Rig
-from tests.strategies_formats import (
-    BOTH_LENSES,
-    POINTS_RIG,
-    assert_same_pixels,
-    fault_of,
-    opencv_pixels,
-    rigs,
-)
+from tests import strategies_formats
 
 MATRIX = "!!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n   data: "
 GOOD = (
@@ -30,7 +23,7 @@ GOOD = (
 )
 
 
-fault = partial(fault_of, read_opencv)
+fault = partial(strategies_formats.fault_of, read_opencv)
 
 
 def write(path: Path, text: str) -> Path:
@@ -40,7 +33,7 @@ def write(path: Path, text: str) -> Path:
 
 @pytest.mark.parametrize("suffix", [".yml", ".xml"])
 @settings(max_examples=25, deadline=None)
-@given(rig=rigs(lenses=BOTH_LENSES))
+@given(rig=strategies_formats.rigs(lenses=strategies_formats.BOTH_LENSES))
 def test_opencv_projects_as_we_do_from_what_its_loader_reads(suffix: str, rig: Rig) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"rig{suffix}"
@@ -64,9 +57,11 @@ def test_opencv_projects_as_we_do_from_what_its_loader_reads(suffix: str, rig: R
         each = [("M1", "D1", zero, zero), ("M2", "D2", turn, read["T"])]
     for (name, camera), (m, d, rvec, tvec) in zip(rig.cameras.items(), each, strict=True):
         assert (read[d].size == 4) == (camera.lens.model == "fisheye")
-        seen = opencv_pixels(POINTS_RIG, rvec, tvec, read[m], read[d])
-        ours = camera.project(rig.cam_from_rig[name].apply(POINTS_RIG))
-        assert_same_pixels(ours, seen + 0.5)
+        seen = strategies_formats.opencv_pixels(
+            strategies_formats.POINTS_RIG, rvec, tvec, read[m], read[d]
+        )
+        ours = camera.project(rig.cam_from_rig[name].apply(strategies_formats.POINTS_RIG))
+        strategies_formats.assert_same_pixels(ours, seen + 0.5)
 
 
 def test_opencvs_sample_calibration_of_one_camera_is_read(shared_data: Path) -> None:

@@ -40,6 +40,7 @@ def draw(path: Path) -> bytes:
     return path.read_bytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", ["svg", "png", "pdf"])
 def test_plots_are_the_same_each_time(tmp_path: Path, suffix: str) -> None:
     first, again = (draw(tmp_path / f"{name}.{suffix}") for name in "ab")

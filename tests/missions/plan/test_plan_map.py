@@ -11,6 +11,7 @@ from alice_survey.core.executor import SERIAL
 from missions.plan.map import map_report
 
 
+@pytest.mark.slow
 def test_a_finished_plan_is_drawn_again_for_print(tmp_path: Path) -> None:
     config = parse_config({"area": {"length_m": 4.0, "width_m": 3.0}}, "test")
     spec("plan").make(tmp_path, config, SERIAL)

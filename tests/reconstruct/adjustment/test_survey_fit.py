@@ -40,6 +40,7 @@ from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.placing.alignment import align_similarity
 from tests.engines import PicklingThreads
+from tests.oracles_place import is_unit
 from tests.reconstruct.rig_survey import four_cameras
 from tests.reconstruct.scenes import Scene, make_scene
 from tests.reconstruct.true_models import DISTANCES, points_of, pupils, refracted, rigid_rms
@@ -330,7 +331,7 @@ def test_scales_lie_within_their_sigmas_where_the_index_is_drawn(tmp_path: Path)
         for rig, ratios in ((knowing_water(believed, SIGMA), counted), (believed, ignored)):
             error, sigma = scale_error_and_sigma(believing(scene, rig, tmp_path), scene)
             ratios.append(error / sigma)
-    assert 0.7 < np.sqrt(np.mean(np.square(counted))) < 1.4
+    assert is_unit(counted, 12)
     assert np.sqrt(np.mean(np.square(ignored))) > 1.5
 
 

@@ -34,16 +34,9 @@ from reconstruct.placing.track import picture_modes
 from reconstruct.views.model_files import as_transform
 from tests.engines import PicklingThreads
 from tests.oracles_refraction import dense_normal_equations, dense_of, laid_onto
+from tests.reconstruct import true_models
 from tests.reconstruct.adjustment.test_survey_fit import with_sigmas
 from tests.reconstruct.scenes import DATUM, Scene, make_scene, stating
-from tests.reconstruct.true_models import (
-    DISTANCES,
-    refracted,
-    rigid_rms,
-    started,
-    true_stations,
-    warped_scene,
-)
 
 NOISE_PX = 0.3
 
@@ -58,7 +51,7 @@ def drawn(seed: int, folder: Path) -> tuple[Scene, Mapped]:
     rng = np.random.default_rng(seed)
     pixels = [p + rng.normal(0, NOISE_PX, p.shape) for p in clean().pixels]
     scene = replace(clean(), pixels=pixels)
-    return scene, refracted(scene, folder, rng)[0]
+    return scene, true_models.refracted(scene, folder, rng)[0]
 
 
 def test_errors_are_as_large_as_stated(tmp_path: Path) -> None:
@@ -134,7 +127,7 @@ def _observations(mapped: Mapped) -> LinearObservations:
 def _away(mapped: Mapped, found: uncertainty.Uncertainty, scene: Scene) -> tuple[Array, Array]:
     """Errors of stations and points; the usual depth weighs turns against positions."""
     depth_m = float(np.median(np.linalg.norm(_observations(mapped).arm, axis=1)))
-    true = true_stations(scene, mapped)
+    true = true_models.true_stations(scene, mapped)
     return laid_onto(mapped.model, found, true, scene.points_ned, depth_m)
 
 
@@ -198,13 +191,13 @@ def off(rig: Rig, steps: dict[str, float]) -> Rig:
 
 def points_with(rig: Rig, folder: Path, seed: int = 0) -> tuple[Mapped, Array]:
     """The model of the same pictures by who believes in a rig, and its points."""
-    mapped, _ = refracted(replace(noisy(seed), rig=rig), folder)
+    mapped, _ = true_models.refracted(replace(noisy(seed), rig=rig), folder)
     return mapped, observations(mapped.model).points
 
 
 def part_of(mapped: Mapped, scene: Scene) -> Any:
     """What errors of a rig that is held do."""
-    seen, _ = warped_scene(scene)
+    seen, _ = true_models.warped_scene(scene)
     return fit_survey(mapped, seen, scene.rig, port=False, pose=False).calibration
 
 
@@ -355,8 +348,10 @@ def on_known_rig() -> Scene:
 @pytest.fixture(scope="module")
 def survey(tmp_path_factory: pytest.TempPathFactory) -> AdjustedSurvey:
     scene = on_known_rig()
-    mapped, _ = refracted(scene, tmp_path_factory.mktemp("refract"))
-    return adjust_survey(mapped, scene.records, scene.rig, DISTANCES, ReconstructConfig())
+    mapped, _ = true_models.refracted(scene, tmp_path_factory.mktemp("refract"))
+    return adjust_survey(
+        mapped, scene.records, scene.rig, true_models.DISTANCES, ReconstructConfig()
+    )
 
 
 def hessian_of(survey: AdjustedSurvey) -> Array:
@@ -436,14 +431,14 @@ def mute(scene: Scene) -> Scene:
 
 
 def flown(scene: Scene, folder: Path) -> Adjusted:
-    start, seen = started(scene)
-    return adjusted(start, seen, scene.rig, DISTANCES, DATUM, folder)
+    start, seen = true_models.started(scene)
+    return adjusted(start, seen, scene.rig, true_models.DISTANCES, DATUM, folder)
 
 
 def rms_and_scale(found: Adjusted, scene: Scene) -> tuple[float, float]:
     true = RigidTransform.concatenate(scene.left.ned_from_cam).translation
     at = found.ned_from_cam.translation
-    return rigid_rms(at, true), align_similarity(at, true).scale - 1.0
+    return true_models.rigid_rms(at, true), align_similarity(at, true).scale - 1.0
 
 
 @pytest.mark.slow
@@ -483,7 +478,7 @@ def test_one_camera_takes_scale_and_shape_from_navigation() -> None:
 
 def placed_alone(scene: Scene, rng: np.random.Generator) -> tuple[float, float, float, float]:
     """Error and sigma of the scale; median of cameras after a similarity, before and with modes."""
-    start, _ = started(scene, rng)
+    start, _ = true_models.started(scene, rng)
     mapped = adjust_freely(replace(start, scaled=False, baseline=np.nan))
     model = pycolmap.Reconstruction(mapped.model)
     model.transform(pycolmap.Sim3d(1.0 / 0.37, pycolmap.Rotation3d(), np.zeros(3)))
@@ -503,7 +498,7 @@ def placed_alone(scene: Scene, rng: np.random.Generator) -> tuple[float, float, 
         modes=picture_modes(found.shape, scene.records, pinholes),
     )  # fmt: skip
     after = found.deform(fit.modes, fit.joint[PLACE:, PLACE:]).mapped.model
-    true = np.array([pose.translation for pose in true_stations(scene, start)])
+    true = np.array([pose.translation for pose in true_models.true_stations(scene, start)])
     rms, aligned = [], []
     for one in (found.mapped.model, after):
         at = np.array([one.images[n].projection_center() for n in sorted(one.images)])

@@ -49,7 +49,7 @@ def test_witnesses_through_a_tilted_port_equal_their_slow_twin(tmp_path):
 
     def right(first: KernelLens, second: KernelLens) -> float:
         confirmed, refuted = count_confirming(
-            depth, sigma, slopes_of(depth, first), np.ascontiguousarray(move.as_matrix()[:3]),
+            depth, sigma, slopes_of(depth, first, 0, 0), np.ascontiguousarray(move.as_matrix()[:3]),
             other_depth, factor, second, 3.0,
         )  # fmt: skip
         assert not (confirmed & refuted).any()

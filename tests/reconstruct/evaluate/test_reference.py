@@ -172,6 +172,7 @@ def test_a_real_cloud_is_read_in_local_metres(shared_data: Path) -> None:
     assert 150 < points[:, 2].min() < points[:, 2].max() < 175
 
 
+@pytest.mark.slow
 def test_packed_points_that_are_damaged_are_refused(tmp_path: Path) -> None:
     """Unpacking them here would end the program."""
     path = write_cloud(tmp_path / "c.laz", utm(ground(np.random.default_rng(7), 3_000)))

@@ -6,20 +6,9 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.executor import SERIAL, local_executor
+from reconstruct.mapping import global_mapper
 from reconstruct.mapping.arrays import model_groups
-from reconstruct.mapping.global_mapper import (
-    StationLink,
-    average_poses,
-    link_stations,
-    station_groups,
-    stereo_points,
-)
-from tests.reconstruct.mapping.test_mapper import (
-    camera_rms,
-    mapped_scene,
-    pinhole_rig,
-    seen_by_pinholes,
-)
+from tests.reconstruct.mapping import test_mapper
 from tests.reconstruct.scenes import Scene, make_scene
 from tests.reconstruct.true_models import pupils, rigid_rms
 
@@ -34,7 +23,7 @@ def station_poses(scene: Scene) -> dict[int, RigidTransform]:
 
 def ring(
     rng: np.random.Generator, noise: float = 0.0
-) -> tuple[list[StationLink], list[RigidTransform]]:
+) -> tuple[list[global_mapper.StationLink], list[RigidTransform]]:
     """Twelve stations, each linked to the next three, with exact or noisy relative poses."""
 
     def drawn(count: int, metres: float, turn_rad: float) -> RigidTransform:
@@ -50,16 +39,16 @@ def ring(
     return [linked(*pair, pose) for pair, pose in zip(ends, relative, strict=True)], poses
 
 
-def linked(a: int, b: int, pose: RigidTransform) -> StationLink:
-    return StationLink(
+def linked(a: int, b: int, pose: RigidTransform) -> global_mapper.StationLink:
+    return global_mapper.StationLink(
         first=a, second=b, quaternion=pose.rotation.as_quat(), shift=pose.translation,
         turn_variance=1e-6, shift_variance=4e-6,
     )  # fmt: skip
 
 
-def misses(links: list[StationLink], poses: list[RigidTransform]) -> np.ndarray:
+def misses(links: list[global_mapper.StationLink], poses: list[RigidTransform]) -> np.ndarray:
     """Errors (rotation in rad, position) after moving both to the first station's frame."""
-    found = average_poses(links)
+    found = global_mapper.average_poses(links)
     errors = [found[k] * found[0].inv() * poses[0] * pose.inv() for k, pose in enumerate(poses)]
     return np.array([[e.rotation.magnitude(), np.linalg.norm(e.translation)] for e in errors[1:]])
 
@@ -85,15 +74,15 @@ def test_averaging_beats_the_links_and_ignores_a_wrong_one() -> None:
 def test_groups_without_a_link_stay_apart() -> None:
     links, _ = ring(np.random.default_rng(3))
     far = linked(40, 41, RigidTransform.identity())
-    assert station_groups([*links, far]) == [list(range(12)), [40, 41]]
+    assert global_mapper.station_groups([*links, far]) == [list(range(12)), [40, 41]]
     with pytest.raises(ValueError):
-        average_poses([*links, far])
+        global_mapper.average_poses([*links, far])
 
 
 def test_stereo_points_lie_where_the_floor_is() -> None:
     scene = make_scene(lines=1, stations=2, points=2500)
-    seen = seen_by_pinholes(scene)
-    found = stereo_points(seen, pinhole_rig(scene, seen))
+    seen = test_mapper.seen_by_pinholes(scene)
+    found = global_mapper.stereo_points(seen, test_mapper.pinhole_rig(scene, seen))
     poses = station_poses(scene)
     for record, points, ids in zip(scene.records, found, scene.ids, strict=True):
         known = np.isfinite(points[:, 0])
@@ -105,8 +94,8 @@ def test_stereo_points_lie_where_the_floor_is() -> None:
 
 def test_links_are_the_true_relative_poses() -> None:
     scene = make_scene(lines=2, stations=4, points=5000, noise_px=0.1)
-    seen = seen_by_pinholes(scene)
-    links = link_stations(seen, pinhole_rig(scene, seen), 1, SERIAL)
+    seen = test_mapper.seen_by_pinholes(scene)
+    links = global_mapper.link_stations(seen, test_mapper.pinhole_rig(scene, seen), 1, SERIAL)
     poses = station_poses(scene)
     assert {(k.first, k.second) for k in links} | {(k.second, k.first) for k in links} >= {
         (k, k + 1) for k in range(3)
@@ -121,12 +110,16 @@ def test_links_are_the_true_relative_poses() -> None:
 
 def test_global_mapping_is_as_good_as_incremental(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = make_scene(lines=3, stations=5, points=7000, noise_px=0.3)
-    at_once = mapped_scene(scene)
+    at_once = test_mapper.mapped_scene(scene)
     monkeypatch.setattr("reconstruct.mapping.mapper.map_globally", lambda *_: [])
-    one_by_one = mapped_scene(scene)
+    one_by_one = test_mapper.mapped_scene(scene)
     assert at_once.models == one_by_one.models == (30,)
     assert "global" in at_once.notes[0] and "incremental" in one_by_one.notes[0]
-    assert 0.2e-3 < camera_rms(at_once, scene) < 1.2 * camera_rms(one_by_one, scene)
+    assert (
+        0.2e-3
+        < test_mapper.camera_rms(at_once, scene)
+        < 1.2 * test_mapper.camera_rms(one_by_one, scene)
+    )
     errors = [m.model.compute_mean_reprojection_error() for m in (at_once, one_by_one)]
     assert errors[0] == pytest.approx(errors[1], rel=0.02)
 
@@ -135,7 +128,9 @@ def test_threads_do_not_change_a_byte(tmp_path: Path) -> None:
     scene = make_scene(lines=2, stations=4, points=3500, noise_px=0.3)
     for threads in (1, 2):
         (tmp_path / str(threads)).mkdir()
-        mapped_scene(scene, local_executor(threads)).model.write_binary(tmp_path / str(threads))
+        test_mapper.mapped_scene(scene, local_executor(threads)).model.write_binary(
+            tmp_path / str(threads)
+        )
     for file in sorted((tmp_path / "1").iterdir()):
         assert file.read_bytes() == (tmp_path / "2" / file.name).read_bytes()
 
@@ -144,7 +139,7 @@ def test_models_that_no_match_links_are_kept_apart() -> None:
     scene = make_scene(lines=1, stations=10, points=6000, noise_px=0.2)
     halves = [record.station < 6 for record in scene.records]
     kept = [pair for pair in scene.pairs if halves[pair[0]] == halves[pair[1]]]
-    mapped = mapped_scene(replace(scene, pairs=kept))
+    mapped = test_mapper.mapped_scene(replace(scene, pairs=kept))
     assert mapped.models == (12, 8)
     assert not [note for note in mapped.notes if "separate model" in note]
     groups = model_groups(mapped.model)

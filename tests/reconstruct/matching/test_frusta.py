@@ -11,13 +11,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.core.frames import Array
 from alice_survey.core.manifest import ImageRecord
 from camera_calib.rig import Rig
-from reconstruct.matching.pairs import (
-    choose_pairs,
-    frusta_of,
-    neighbours,
-    overlap_shares,
-    placed_pictures,
-)
+from reconstruct.matching import pairs
 from tests.reconstruct.scenes import DATUM, make_scene
 
 DISTANCE_M = 2.0
@@ -72,8 +66,8 @@ def test_shares_are_those_of_the_wall() -> None:
     right, down = 0.3 * wide, 0.4 * high
     places = [[0, 0, 10], [0, right, 10], [0, 0, 10 + down], [0, right, 10 + down]]
     records = records_at(np.array(places), np.zeros(4), ["left"])
-    frusta = frusta_of(records, rig, DATUM, DISTANCE_M, DISTANCE_M * (1 + 1e-9))
-    found = overlap_shares(frusta, [(0, 1), (0, 2), (0, 3)], np.zeros(4))
+    frusta = pairs.frusta_of(records, rig, DATUM, DISTANCE_M, DISTANCE_M * (1 + 1e-9))
+    found = pairs.overlap_shares(frusta, [(0, 1), (0, 2), (0, 3)], np.zeros(4))
     # A lattice of six rays a side counts in sixths.
     for pair, expected in {(0, 1): 0.7, (0, 2): 0.6, (0, 3): 0.42}.items():
         assert found[pair][0] == pytest.approx(expected, abs=0.13)
@@ -85,15 +79,15 @@ def test_pictures_of_a_wall_are_paired_with_all_around_and_no_others() -> None:
     wide, high = width_m(rig)
     step = 0.35 * min(wide, high)
     records = wall(12, 4, step)
-    assert not placed_pictures(records, rig, DATUM)
-    assert placed_pictures(records, rig, DATUM, RANGE_M) == set(range(len(records)))
-    sure, maybe = choose_pairs(records, rig, DATUM, (), RANGE_M)
+    assert not pairs.placed_pictures(records, rig, DATUM)
+    assert pairs.placed_pictures(records, rig, DATUM, RANGE_M) == set(range(len(records)))
+    sure, maybe = pairs.choose_pairs(records, rig, DATUM, (), RANGE_M)
     places = DATUM.ned_from_geodetic(
         np.array([[r.latitude_deg, r.longitude_deg, r.depth_m] for r in records])
     )
     apart = np.abs(places[:, None, 1:] - places[None, :, 1:])
     overlap = (1 - apart[..., 0] / wide) * (1 - apart[..., 1] / high)
-    linked = np.array(sorted(set(sure) - neighbours(records, 0)))
+    linked = np.array(sorted(set(sure) - pairs.neighbours(records, 0)))
     assert all(records[i].camera == records[j].camera for i, j in linked.tolist())
     assert overlap[tuple(linked.T)].min() > 0.1
     cameras = np.array([r.camera for r in records])
@@ -110,7 +104,7 @@ def test_opposite_sides_of_a_pile_are_no_partners() -> None:
     angles = np.deg2rad(np.arange(0, 360, 15))
     places = np.column_stack([-2.3 * np.cos(angles), -2.3 * np.sin(angles), np.full(24, 8.0)])
     records = records_at(places, np.rad2deg(angles), ["left"])
-    sure, maybe = choose_pairs(records, rig, DATUM, (), RANGE_M)
+    sure, maybe = pairs.choose_pairs(records, rig, DATUM, (), RANGE_M)
     apart = {
         pair: abs((pair[0] - pair[1] + 12) % 24 - 12) * 15
         for pair in itertools.combinations(range(24), 2)

@@ -9,16 +9,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from alice_survey.core.frames import Array
+from reconstruct.matching import matches
 from reconstruct.matching import matches as matching
 from reconstruct.matching.features import Features, load_features, save_features
-from reconstruct.matching.matches import (
-    PairTask,
-    apply_homography,
-    fit_homography,
-    match_descriptors,
-    match_near,
-    match_pair,
-)
 from tests.oracles_matching import match_slowly
 
 
@@ -37,7 +30,7 @@ def test_matches_equal_those_of_the_slow_twin(
     a = rng.integers(0, 256, (n, 8)).astype(np.uint8)
     b = rng.integers(0, 256, (m, 8)).astype(np.uint8)
     b[: min(n, m) // 2] = a[: min(n, m) // 2]  # some true matches
-    found = match_descriptors(a, b, ratio, block)
+    found = matches.match_descriptors(a, b, ratio, block)
     np.testing.assert_array_equal(found, match_slowly(a, b, ratio))
 
 
@@ -46,13 +39,15 @@ def plain_features(pixels: Array, descriptors: NDArray[Any]) -> Features:
     return Features(pixels=pixels, scale_px=sizes, descriptors=rounded)
 
 
-def pair_task(folder: Path, camera: pycolmap.Camera, *sides: tuple[Array, Array]) -> PairTask:
+def pair_task(
+    folder: Path, camera: pycolmap.Camera, *sides: tuple[Array, Array]
+) -> matches.PairTask:
     """Two pictures of one camera with features (pixels and descriptors) saved in a folder."""
     first, second = folder / "a.npz", folder / "b.npz"
     for path, side in zip((first, second), sides, strict=True):
         save_features(path, plain_features(*side))
     cameras = (camera.todict(), camera.todict())
-    return PairTask(first=first, second=second, ratio=0.8, cameras=cameras, seed=3)
+    return matches.PairTask(first=first, second=second, ratio=0.8, cameras=cameras, seed=3)
 
 
 def pinhole(width: int, height: int, focal_px: float) -> pycolmap.Camera:
@@ -72,12 +67,12 @@ def test_geometry_keeps_true_matches_and_drops_false_ones(tmp_path: Path) -> Non
     sides = np.concatenate([seen, rng.uniform(0, 600, (2, outliers, 2))], axis=1)
     descriptors: Any = rng.integers(0, 90, (120 + outliers, 128))
     task = pair_task(tmp_path, camera, (sides[0], descriptors), (sides[1], descriptors))
-    found = match_pair(task)
+    found = matches.match_pair(task)
     assert found.geometry is not None
     right = int((found.matches[:, 0] < true).sum())
     assert right >= 0.97 * true
     assert len(found.matches) - right <= 4
-    np.testing.assert_array_equal(found.matches, match_pair(task).matches)
+    np.testing.assert_array_equal(found.matches, matches.match_pair(task).matches)
 
 
 @settings(deadline=None, max_examples=40)
@@ -97,7 +92,7 @@ def test_narrowed_matches_equal_those_of_the_slow_twin(
         mates = predicted[np.all(a.pixels // cell == a.pixels[i] // cell, axis=1)]
         low, high = mates.min(axis=0) - radius, mates.max(axis=0) + radius
         searched[i] = ((b.pixels >= low) & (b.pixels <= high)).all(axis=1)
-    found = match_near(a, b, 0.9, predicted, radius, cell)
+    found = matches.match_near(a, b, 0.9, predicted, radius, cell)
     slow = match_slowly(a.descriptors, b.descriptors, 0.9, searched)
     np.testing.assert_array_equal(found, slow)
 
@@ -106,17 +101,17 @@ def test_homographies_come_back_from_exact_matches() -> None:
     rng = np.random.default_rng(9)
     truth = np.array([[1.05, 0.1, 30.0], [-0.08, 0.96, -12.0], [2e-5, -3e-5, 1.0]])
     first = rng.uniform(0, 3000, (40, 2))
-    second = apply_homography(truth, first)
+    second = matches.apply_homography(truth, first)
     np.testing.assert_allclose(
-        apply_homography(fit_homography(first, second), first), second, atol=1e-6
+        matches.apply_homography(matches.fit_homography(first, second), first), second, atol=1e-6
     )
     horizon = np.array([[1, 0, 0], [0, 1, 0], [-1e-3, 0, 1]])
     places = np.column_stack([[100.0, 200.0, 300.0, 1500.0], np.zeros(4)])
-    moved = apply_homography(horizon, places)
+    moved = matches.apply_homography(horizon, places)
     np.testing.assert_array_equal(np.isnan(moved[:, 0]), [False, False, False, True])
 
 
-def repeated_texture(tmp_path: Path, alike: int) -> PairTask:
+def repeated_texture(tmp_path: Path, alike: int) -> matches.PairTask:
     """3000 true points, of which `alike` have a double elsewhere that looks the same to a few."""
     rng = np.random.default_rng(11)
     camera = pinhole(3000, 2400, 3000)
@@ -134,9 +129,9 @@ def test_prediction_finds_what_looks_alike_and_loses_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     task = repeated_texture(tmp_path, alike=800)
-    guided = match_pair(task)
+    guided = matches.match_pair(task)
     monkeypatch.setattr(matching, "_WORTH_PROBING", np.inf)
-    full = match_pair(task)
+    full = matches.match_pair(task)
     assert np.all(guided.matches[:, 0] == guided.matches[:, 1])
     assert len(full.matches) >= 2000
     assert len(guided.matches) >= len(full.matches) + 200
@@ -148,5 +143,5 @@ def test_where_the_largest_features_agree_on_nothing_all_are_compared(tmp_path: 
     b = load_features(task.second)
     b.descriptors[:1500] = np.random.default_rng(12).integers(0, 90, (1500, 128))
     save_features(task.second, b)
-    found = match_pair(task).matches
+    found = matches.match_pair(task).matches
     assert len(found) >= 1300 and found.min() >= 1500

@@ -7,12 +7,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.core.artefacts import write_json
-from reconstruct.adjustment.uncertainty import (
-    SharedMotions,
-    Uncertainty,
-    no_modes,
-    write_uncertainty,
-)
+from reconstruct.adjustment import uncertainty
 from reconstruct.measure.errors import in_plane, own_correlation
 from reconstruct.measure.shapes import measure_line
 from reconstruct.measure.surface import MeasuredSurface
@@ -22,23 +17,23 @@ from tests.alice_survey.app.report.tiny import SIGMA_M, SLOPE, tiny_workspace
 BOUNDS = (0.0, 0.0, 0.8, 1.2)
 
 
-def known(folder: Path, shared: SharedMotions | None) -> None:
+def known(folder: Path, shared: uncertainty.SharedMotions | None) -> None:
     """Write what points share as the placing does."""
-    found = Uncertainty(
+    found = uncertainty.Uncertainty(
         frames=np.zeros(0, np.int64), stations=np.zeros(0, np.int64), images=(),
         frame_cov=np.zeros((0, 6, 6)), point_ids=np.zeros(0, np.int64),
         point_cov=np.zeros((0, 3, 3)), point_noise=np.zeros((0, 3, 3)), sigma_px=0.3,
-        modes=no_modes(0, 0), shared=shared,
+        modes=uncertainty.no_modes(0, 0), shared=shared,
     )  # fmt: skip
-    write_uncertainty(folder / "sparse" / "covariance.npz", found)
+    uncertainty.write_uncertainty(folder / "sparse" / "covariance.npz", found)
 
 
-def growing(sigma: float) -> SharedMotions:
+def growing(sigma: float) -> uncertainty.SharedMotions:
     """Points of the tiny surface, NED, that all grow about a place together."""
     east, north = np.random.default_rng(0).uniform(-0.2, 1.4, (2, 1500))
     ned = np.column_stack([north, east, 10.0 - SLOPE * east])
     motions = sigma * (ned - [0.6, 0.4, 9.9])
-    return SharedMotions(ned, motions[:, :, None], np.eye(1), np.zeros((1500, 3, 3)))
+    return uncertainty.SharedMotions(ned, motions[:, :, None], np.eye(1), np.zeros((1500, 3, 3)))
 
 
 def test_a_model_that_grows_changes_lengths_by_its_share(tmp_path: Path) -> None:
@@ -59,7 +54,7 @@ def test_what_all_heights_share_is_no_cells_own(tmp_path: Path) -> None:
     shift = growing(0.0)
     up = np.zeros((1500, 3, 1))
     up[:, 2] = 0.8 * SIGMA_M
-    known(folder, SharedMotions(shift.places, up, np.eye(1), shift.rest))
+    known(folder, uncertainty.SharedMotions(shift.places, up, np.eye(1), shift.rest))
     surface = MeasuredSurface.of(folder)
     own = surface.window(30, 30, 5, 5)[1]
     np.testing.assert_allclose(own, 0.6 * SIGMA_M, rtol=1e-5)
@@ -93,7 +88,7 @@ def test_motions_turn_with_the_plane() -> None:
         name="wall", about="", plane_from_world=RigidTransform.from_rotation(facing(180.0, 0.0))
     )
     south = np.array([[[-1.0], [0.0], [0.0]]])
-    shared = SharedMotions(
+    shared = uncertainty.SharedMotions(
         np.array([[1.0, 2.0, 3.0]]), south, np.eye(1), south @ south[:, :, :1].swapaxes(1, 2)
     )
     found = in_plane(shared, plane)

@@ -18,15 +18,8 @@ from reconstruct.mesh.cells import decimate
 from reconstruct.mesh.surface import splat
 from reconstruct.mesh.texture import spread_corners
 from reconstruct.mesh.topology import edges_of
+from tests import oracles_dense
 from tests.engines import PicklingThreads
-from tests.oracles_dense import (
-    DEPTH_M,
-    FRAME,
-    Scene,
-    position_code,
-    stereo_views,
-    write_workspace,
-)  # fmt: skip
 from tests.oracles_mesh import boxes_overlap, implicit_value, spread_value
 
 STEP_M = 0.012
@@ -36,10 +29,10 @@ HOLE = (0.35, 0.1, 0.09)
 
 
 def bump(north: np.ndarray, east: np.ndarray) -> np.ndarray:
-    return DEPTH_M - 0.1 * np.exp(-((north - 0.1) ** 2 + east**2) / 0.03)
+    return oracles_dense.DEPTH_M - 0.1 * np.exp(-((north - 0.1) ** 2 + east**2) / 0.03)
 
 
-SCENE = Scene(depth_of=bump, paint=position_code)
+SCENE = oracles_dense.Scene(depth_of=bump, paint=oracles_dense.position_code)
 
 
 def write_dense(folder: Path, images: list[str]) -> None:
@@ -57,8 +50,8 @@ def write_dense(folder: Path, images: list[str]) -> None:
     points["x"], points["y"], points["z"] = east, north, -bump(north, east) - OFFSET[2]
     points["nx"], points["ny"], points["nz"] = normal.T
     points["sigma"] = 1e-3
-    write_cloud(dense / "cloud.ply", [points], OFFSET, FRAME)
-    write_cloud_json(dense / "cloud.json", len(points), OFFSET, STEP_M, FRAME)
+    write_cloud(dense / "cloud.ply", [points], OFFSET, oracles_dense.FRAME)
+    write_cloud_json(dense / "cloud.json", len(points), OFFSET, STEP_M, oracles_dense.FRAME)
     patterns = {camera: np.zeros((*GRID, 3)) for camera in ("left", "right")}
     gains = {image: np.zeros(3) for image in images}
     light = LightModel(patterns=patterns, gains=gains, white=np.ones(3))
@@ -68,8 +61,8 @@ def write_dense(folder: Path, images: list[str]) -> None:
 
 def make_workspace(folder: Path, others: Sequence[str] = ()) -> None:
     """Three stations over the bump; `others` are pictures that only the light knows."""
-    views = stereo_views(np.array([-0.2, 0.2, 0.5]), np.array([0.0, 0.05, 0.0]))
-    write_workspace(folder, views, SCENE)
+    views = oracles_dense.stereo_views(np.array([-0.2, 0.2, 0.5]), np.array([0.0, 0.05, 0.0]))
+    oracles_dense.write_workspace(folder, views, SCENE)
     write_dense(folder, [*(view.image for view in views), *others])
 
 
@@ -124,7 +117,7 @@ def test_texture_shows_the_coordinates_of_the_surface(mesh: Path):
             page, x.astype(np.float32)[:, None], y.astype(np.float32)[:, None], cv2.INTER_LINEAR
         )[:, 0, ::-1]
         east, north = part.vertices[:, 0], -part.vertices[:, 2]
-        worst.append(np.abs(shown - position_code(north, east)).max(axis=1))
+        worst.append(np.abs(shown - oracles_dense.position_code(north, east)).max(axis=1))
     miss = np.concatenate(worst)
     assert np.median(miss) < 6 and np.percentile(miss, 95) < 25  # 2 levels a millimetre
     obj = trimesh.load(mesh / "mesh.obj")

@@ -59,6 +59,7 @@ def written(folder: Path, side_px: int) -> tuple[float, float]:
     return share, int(re.findall(r"VmHWM:\s+(\d+) kB", status)[0]) / 1024
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "side_px", [8 * TILE_PX, pytest.param(33 * TILE_PX, marks=pytest.mark.slow)]
 )

@@ -50,7 +50,9 @@ def overlaps(x_px: NDArray[Any], taken: Sequence[int]) -> NDArray[Any]:
     return 1.0 - np.abs(np.diff(x_px[list(taken)])) / WIDTH
 
 
-@pytest.mark.parametrize("overlap", [0.6, 0.7, 0.85])
+@pytest.mark.parametrize(
+    "overlap", [0.7, *(pytest.param(o, marks=pytest.mark.slow) for o in (0.6, 0.85))]
+)
 def test_neighbours_overlap_as_wanted_at_any_speed(overlap: float) -> None:
     """A diver who hurries, dawdles, stops for 3 s and goes back over new ground."""
     speeds = np.repeat([4.0, 11.0, 1.5, 0.0, 7.0], [40, 40, 50, 60, 40])  # px a frame

@@ -167,6 +167,7 @@ def rms(values: Sequence[float] | Array) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
+@pytest.mark.slow
 def test_patches_lie_to_each_other_as_well_as_is_stated(tmp_path: Path) -> None:
     """Of 20 surveys the errors are 1.13 times their sigmas; shapes are as of a patch alone."""
     ratios, whole, shapes, alone = [], [], [], []

@@ -18,6 +18,7 @@ from reconstruct.placing.alignment import Similarity, level
 from reconstruct.placing.fit import fit_navigation
 from reconstruct.placing.place import Placed, Placing, find_place, scale_by_altitudes
 from reconstruct.views.model_files import as_transform
+from tests.oracles_place import is_unit
 from tests.reconstruct.placing.test_georeference import (
     exact,
     fit,
@@ -133,8 +134,8 @@ def test_scale_and_level_of_one_camera_lie_within_their_sigmas(reading: str) -> 
         errors.append(np.log(found.ned_from_model.scale / truth.scale) / found.sigma_scale)
         lean = (found.ned_from_model.rotation * truth.rotation.inv()).as_rotvec(degrees=True)[:2]
         leans.append(lean / np.rad2deg(np.sqrt(np.diag(found.covariance)[:2])))
-    assert 0.7 < np.sqrt(np.mean(np.square(errors))) < 1.4
-    assert 0.6 < np.sqrt(np.mean(np.square(leans))) < 1.4
+    assert is_unit(errors, 24)
+    assert is_unit(leans, 48)
 
 
 def test_headings_and_depths_turn_a_model_to_north() -> None:
@@ -170,7 +171,7 @@ def test_altitudes_scale_a_model_within_their_sigma() -> None:
         found = scale_by_altitudes(records, centres / metres, scene.points_ned / metres)
         assert found is not None
         errors.append(np.log(found[0] / metres) / found[1])
-    assert 0.7 < np.sqrt(np.mean(np.square(errors))) < 1.4
+    assert is_unit(errors, 24)
     unknown = with_only(scene.records)
     assert scale_by_altitudes(unknown, centres / metres, scene.points_ned / metres) is None
 

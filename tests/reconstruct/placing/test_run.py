@@ -22,17 +22,11 @@ from reconstruct.mapping.arrays import ground_pixel, observations
 from reconstruct.picking.lengths import scale_model
 from reconstruct.pictures.importing import import_images
 from reconstruct.pictures.undistorted import Pictures
+from reconstruct.placing import run
 from reconstruct.placing.alignment import bend_of
 from reconstruct.placing.control_command import import_control
 from reconstruct.placing.control_points import RegisteredPicture
 from reconstruct.placing.navigation import body_from_pinhole
-from reconstruct.placing.run import (
-    check_mapping,
-    measure_doming,
-    navigation_residuals,
-    pinhole_positions,
-    scale_of_pairs,
-)
 from reconstruct.placing.track import read_track_poses
 from reconstruct.views.model import SparseModel, read_model, read_warps
 from tests.reconstruct.mapping.test_mapper import block, block_mapped
@@ -82,6 +76,7 @@ def test_a_drone_block_is_registered_scaled_and_placed_by_its_gps(drone: Path) -
         assert view.world_from_cam.rotation.apply([0, 0, 1])[2] > 0.95  # looks down
 
 
+@pytest.mark.slow
 def test_two_processes_give_the_same_bytes(drone: Path, tmp_path: Path) -> None:
     other = tmp_path / "other"
     import_images(other, [drone / "in"])
@@ -166,6 +161,7 @@ def test_without_positions_the_model_is_level_unscaled_and_says_so(nowhere: Path
         reconstruct(nowhere, QUICK, SERIAL)
 
 
+@pytest.mark.slow
 def test_real_stereo_without_calibration_gets_one_rigid_rig(
     shared_data: Path, tmp_path: Path
 ) -> None:
@@ -211,6 +207,7 @@ def test_a_rig_of_other_pictures_is_refused(drone: Path, tmp_path: Path) -> None
         reconstruct(folder, QUICK, SERIAL)
 
 
+@pytest.mark.slow
 def test_ground_control_of_handheld_gps_is_fitted_robustly(
     drone: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -275,7 +272,7 @@ def survey(seed: int, count: int = 60) -> tuple[np.ndarray, np.ndarray]:
 def test_stations_that_jumped_stand_out_of_those_that_did_not(seed: int) -> None:
     centres, stated = survey(seed)
     stated[[7, 21, 22]] += [[0.0, 3.0, 0.0], [-9.0, 4.0, 0.0], [200.0, 0.0, 0.0]]
-    off, sigma = navigation_residuals(centres, stated, np.full(stated.shape, 0.1))
+    off, sigma = run.navigation_residuals(centres, stated, np.full(stated.shape, 0.1))
     assert off[[7, 21, 22]] == pytest.approx([3.0, np.hypot(9, 4), 200.0], abs=0.5)
     rest = np.delete(off, [7, 21, 22])
     assert rest.max() < 0.5
@@ -289,8 +286,8 @@ def test_a_jump_is_reported_by_name_and_small_misses_are_not(
     scene, mapped = block(), block_mapped()
     capsys.readouterr()  # of a slow machine's progress
     mounts = body_from_pinhole(scene.rig, mapped.warps)
-    positions, sigmas = pinhole_positions(scene.records, mounts, DATUM)
-    good = check_mapping(mapped.model, scene.records, positions, sigmas, 0.0, SURE)
+    positions, sigmas = run.pinhole_positions(scene.records, mounts, DATUM)
+    good = run.check_mapping(mapped.model, scene.records, positions, sigmas, 0.0, SURE)
     assert good.notes == ()
     assert good.far == ()
     assert good.checked == len({r.station for r in scene.records})
@@ -300,9 +297,9 @@ def test_a_jump_is_reported_by_name_and_small_misses_are_not(
     station = scene.records[4].station
     rows = [i for i, r in enumerate(scene.records) if r.station == station]
     jumped[rows] += [0.0, 0.4, 0.0]  # far by sigmas, but not by metres
-    assert check_mapping(mapped.model, scene.records, jumped, fine, 0.0, SURE).far == ()
+    assert run.check_mapping(mapped.model, scene.records, jumped, fine, 0.0, SURE).far == ()
     jumped[rows] += [0.0, 2.0, 0.0]
-    found = check_mapping(mapped.model, scene.records, jumped, fine, 0.0, SURE)
+    found = run.check_mapping(mapped.model, scene.records, jumped, fine, 0.0, SURE)
     assert [far.station for far in found.far] == [station]
     assert found.far[0].off_m == pytest.approx(2.4, abs=0.1)
     assert f"{scene.records[rows[0]].image} (2." in capsys.readouterr().err
@@ -316,7 +313,7 @@ def test_a_rig_that_came_out_another_size_is_reported(capsys: pytest.CaptureFixt
 
     def notes(rig_error: float, scale: ScaleOfPairs) -> tuple[str, ...]:
         records = scene.records
-        return check_mapping(mapped.model, records, unknown, unknown, rig_error, scale).notes
+        return run.check_mapping(mapped.model, records, unknown, unknown, rig_error, scale).notes
 
     assert notes(0.9e-3, SURE) == ()
     assert "-0.20 %" in notes(-2e-3, SURE)[0]
@@ -333,12 +330,12 @@ def test_a_significant_bend_is_reported_and_a_small_one_is_not(
     capsys.readouterr()  # of a slow machine's progress
     large = bend_of(curvature_per_m=0.05, sigma_per_m=1e-3, length_m=4.0)
     small = bend_of(curvature_per_m=1e-4, sigma_per_m=1e-4, length_m=2.0)
-    straight = measure_doming(mapped.model, (small, small))
+    straight = run.measure_doming(mapped.model, (small, small))
     assert straight.notes == ()
     assert not capsys.readouterr().err
     focal = mapped.warps["left"].pinhole.focal_px
     assert straight.pixel_m == pytest.approx(ALTITUDE_M / focal, rel=0.1)
-    found = measure_doming(mapped.model, (large, small))
+    found = run.measure_doming(mapped.model, (large, small))
     assert found.along == large and found.across == small
     assert "bent along the block: +100.0 +/- 2.0 mm over 4.0 m" in found.notes[0]
     assert len(capsys.readouterr().err.splitlines()) == len(found.notes) == 1
@@ -348,14 +345,14 @@ def test_the_scale_shows_a_model_whose_depths_are_stretched() -> None:
     """Points 1 % farther from the cameras than each station's own stereo has them."""
     mapped = block_mapped()
     model = pycolmap.Reconstruction(mapped.model)
-    before = scale_of_pairs(model, observations(model))
+    before = run.scale_of_pairs(model, observations(model))
     assert before is not None
     assert abs(before.mean - 1.0) < 4 * before.mean_sigma + 1e-4
     down = np.median([i.cam_from_world().matrix()[2, :3] for i in model.images.values()], axis=0)
     height = np.median([i.projection_center() @ down for i in model.images.values()])
     for point in model.points3D.values():
         point.xyz = point.xyz + 0.01 * (point.xyz @ down - height) * down
-    after = scale_of_pairs(model, observations(model))
+    after = run.scale_of_pairs(model, observations(model))
     assert after is not None
     assert after.mean == pytest.approx(1.01 * before.mean, abs=4e-4)
     assert after.mean - 1.0 > 3 * after.mean_sigma

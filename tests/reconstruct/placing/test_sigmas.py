@@ -25,6 +25,7 @@ from reconstruct.placing.navigation import USUAL_INSTALLATION, Installation
 from reconstruct.placing.place import fit_with_mount
 from tests.oracles_place import covariance_matrix, standard_residuals_densely
 
+SLOW = pytest.mark.slow
 DATUM = Datum(32.8236, 34.9553)
 SIGMA = np.array([0.06, 0.06, 0.05, *np.deg2rad([0.05, 0.05, 0.3])])
 """Of north, east, depth (m), roll, pitch, heading (rad)."""
@@ -123,7 +124,7 @@ def place(
     return fit, errors, np.r_[sigma[3:6], sigma[:3], sigma[6]]
 
 
-@pytest.mark.parametrize("tau_s", [1.0, 40.0, 4000.0])
+@pytest.mark.parametrize("tau_s", [40.0, *(pytest.param(t, marks=SLOW) for t in (1.0, 4000.0))])
 def test_errors_over_their_sigmas_are_of_unit_size(tau_s: float) -> None:
     """From white errors to ones that outlast the survey; a wrong independence gives 3 to 7."""
     body, ratios = flight(), []
@@ -214,7 +215,7 @@ def test_a_clock_that_is_off_by_more_than_stated_is_named_with_its_setting(
     assert abs(abs(value) - 1.0) < 4 * sigma < 1.0
 
 
-@pytest.mark.parametrize("drift_m", [0.0, 0.036, 0.4])
+@pytest.mark.parametrize("drift_m", [0.036, *(pytest.param(d, marks=SLOW) for d in (0.0, 0.4))])
 def test_a_drift_of_depths_is_named_and_costs_the_depth(
     drift_m: float, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -365,6 +366,7 @@ def test_long_gaps_lie_between_dives() -> None:
     assert dives_of(400.0 * np.arange(5.0)).tolist() == [0] * 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("restart", [True, False])
 def test_two_dives_are_as_sure_as_their_errors_are_independent(restart: bool) -> None:
     found, stated, restarts = [], [], []
@@ -383,6 +385,7 @@ def test_two_dives_are_as_sure_as_their_errors_are_independent(restart: bool) ->
         assert 0.75 < share < 1.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("jump_m", [0.5, 5.0])
 def test_dives_that_contradict_each_other_leave_the_place_that_unsure(jump_m: float) -> None:
     ratios = []
@@ -443,12 +446,14 @@ def whitened(factor: float) -> tuple[Array, Array]:
     return np.array(found), np.array(off)
 
 
+@pytest.mark.slow
 def test_modes_of_the_stated_size_stay_as_they_are() -> None:
     found, off = whitened(1.0)
     assert np.count_nonzero(found > 1.0) <= 1
     assert 0.8 < np.sqrt((off**2).mean()) < 1.2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [2.5, 6.0])
 def test_modes_larger_than_stated_are_found_and_their_sigmas_are_true(factor: float) -> None:
     found, off = whitened(factor)
@@ -474,6 +479,7 @@ def bends_of(
     return fit.bends
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tau_s", [1.0, 4000.0])
 def test_a_bent_block_shows_its_curvature(tau_s: float) -> None:
     body = flight(8, 40)
@@ -488,6 +494,7 @@ def test_a_bent_block_shows_its_curvature(tau_s: float) -> None:
         assert along.is_significant(1e-3)
 
 
+@pytest.mark.slow
 def test_straight_blocks_are_not_called_bent_and_sigmas_are_true() -> None:
     body, pulls, called = flight(6, 20), [], 0
     for seed in range(30):
@@ -553,6 +560,7 @@ def with_mount(words: str, seed: int) -> tuple[PlacementFit, RigidTransform, Arr
     return fit, mount, np.roll(errors_of(fit, truth, poses), 3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", ["nadir-bow-left", "forward+45"])
 def test_the_mount_is_found_within_its_sigmas(words: str) -> None:
     turns, arms, places = [], [], []

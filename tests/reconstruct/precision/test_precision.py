@@ -76,6 +76,7 @@ def figures(found: Precision) -> np.ndarray:
 NAVIGATION = NavigationErrors.of(NavigationConfig(), ReconstructConfig())
 
 
+@pytest.mark.slow
 def test_a_plan_says_how_far_surveys_err(tmp_path: Path) -> None:
     """Sag, scale and heights of surveys of known truth that the pipeline's end adjusts."""
     config = settings(5.0, 4.0)

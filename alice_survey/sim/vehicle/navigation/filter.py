@@ -57,7 +57,7 @@ velocities through the water (4), north and east of the GPS antenna and of the t
 NaN where nothing was measured."""
 READINGS = 27
 
-COMPASS_USE, DEPTH_USE, DVL_USE, WATER_USE, GPS_USE, USBL_USE = 0, 1, 2, 3, 4, 5
+COMPASS_USE, DEPTH_USE, DVL_USE, WATER_USE, GPS_USE, USBL_USE = columns(6)
 """Rows of `counts`."""
 USED, REJECTED, RUN, WIDENED = 0, 1, 2, 3
 """Columns of `counts`: scalars used and rejected, rejected in a row by now, and how often too many
@@ -94,6 +94,11 @@ WIDEN_AFTER = (50, 50, 40, 40, 6, 6)
 """Rejections in a row, of each instrument, after which covariances are widened: 5 s of compass and
 depth, 2 s of the DVL, 6 fixes. Outliers do not come like that: of 1 in 20, 6 in a row once in 64
 million."""
+_WIDENED = (HEADING_BIAS, 2, VELOCITY, WATER, 0, 0)
+_WIDENED_COUNT = (1, 1, 3, 2, 2, 2)
+"""The errors that are widened then: where they begin, and how many."""
+OVER_GROUND, THROUGH_WATER = np.bool_(False), np.bool_(True)
+"""Of a ping's velocities along the beams."""
 
 
 class NavigationState(NamedTuple):
@@ -435,8 +440,6 @@ def weigh(
     place: int,
     innovation: float,
     noise_variance: float,
-    widen_from: int,
-    widen_count: int,
 ) -> bool:
     """Use one measured number, whose row h is in ROW of `scratch`, unless it is too far off.
 
@@ -447,8 +450,6 @@ def weigh(
         place: in `innovations`.
         innovation: measured minus estimated.
         noise_variance: noise variance of the measurement.
-        widen_from: where the errors begin that are widened after too many rejections in a row.
-        widen_count: how many.
 
     Returns:
         Whether it was used.
@@ -466,10 +467,10 @@ def weigh(
         counts[instrument, RUN] += 1
         if counts[instrument, RUN] < WIDEN_AFTER[instrument]:
             return False
-        size2 = 0.0
-        for i in range(widen_from, widen_from + widen_count):
+        size2, first = 0.0, _WIDENED[instrument]
+        for i in range(first, first + _WIDENED_COUNT[instrument]):
             size2 += h[i] * h[i]
-        for i in range(widen_from, widen_from + widen_count):
+        for i in range(first, first + _WIDENED_COUNT[instrument]):
             nav.covariance[i, i] += excess / size2
             w[i] += excess / size2 * h[i]
         variance += excess
@@ -513,7 +514,7 @@ def use_depth(nav: NavigationState, sensors: Sensors) -> bool:
     nav.scratch[ROW, DEPTH_BIAS] = 1.0
     innovation = nav.readings[DEPTH] - believed - nav.nominal[DEPTH_BIAS + 1]
     noise = sensors.pressure.noise_m * sensors.pressure.noise_m
-    return weigh(nav, sensors, DEPTH_USE, INNOVATION_AT[DEPTH_USE], innovation, noise, 2, 1)
+    return weigh(nav, sensors, DEPTH_USE, INNOVATION_AT[DEPTH_USE], innovation, noise)
 
 
 @kernel
@@ -530,9 +531,7 @@ def use_heading(nav: NavigationState, sensors: Sensors) -> bool:
     believed = math.atan2(turned[1, 0], turned[0, 0]) + nav.nominal[HEADING_BIAS + 1]
     innovation = wrap_angle(nav.readings[HEADING] - believed)
     noise = sensors.compass.noise_rad * sensors.compass.noise_rad
-    return weigh(
-        nav, sensors, COMPASS_USE, INNOVATION_AT[COMPASS_USE], innovation, noise, HEADING_BIAS, 1
-    )
+    return weigh(nav, sensors, COMPASS_USE, INNOVATION_AT[COMPASS_USE], innovation, noise)
 
 
 @kernel
@@ -602,44 +601,33 @@ def use_beams(nav: NavigationState, sensors: Sensors, through_water: bool) -> in
         # The rate's noise acts by the same lever as the gyroscopes' bias.
         arm = h[GYRO_BIAS] ** 2 + h[GYRO_BIAS + 1] ** 2 + h[GYRO_BIAS + 2] ** 2
         noise = sigma * sigma + gyro_variance * arm
-        widen_from, count = (WATER, 2) if through_water else (VELOCITY, 3)
         place = INNOVATION_AT[instrument] + i
-        if weigh(nav, sensors, instrument, place, measured - believed, noise, widen_from, count):
+        if weigh(nav, sensors, instrument, place, measured - believed, noise):
             used |= 1 << i
     return used
 
 
 @kernel
-def use_fix(
-    nav: NavigationState,
-    sensors: Sensors,
-    instrument: int,
-    place: int,
-    reading: int,
-    noise_variance: float,
-    bias: int,
-) -> bool:
+def use_fix(nav: NavigationState, sensors: Sensors, instrument: int, noise_variance: float) -> bool:
     """Weigh north and east of a fix together: an outlier in one spoils both.
 
     Args:
         nav: the filter.
         sensors: the instruments.
-        instrument: row of `counts`.
-        place: place of the antenna or transponder in `sensors.place`.
-        reading: reading of north; east follows.
+        instrument: row of `counts`: `GPS_USE`, whose bias is a state, or `USBL_USE`.
         noise_variance: noise variance of each.
-        bias: where the errors of the fix's bias begin; -1 of none.
 
     Returns:
         Whether it was used.
     """
-    counts, x = nav.counts, nav.nominal
+    counts, x, biased = nav.counts, nav.nominal, instrument == GPS_USE
+    reading, place = (GPS_FIX, part.GPS) if biased else (USBL_FIX, part.USBL)
     worst, excess = 0.0, 0.0
     for axis in range(2):
         innovation = nav.readings[reading + axis] - lever_row(nav, sensors, place, axis)
-        if bias >= 0:
-            nav.scratch[ROW, bias + axis] = 1.0
-            innovation -= x[bias + 1 + axis]
+        if biased:
+            nav.scratch[ROW, GPS_BIAS + axis] = 1.0
+            innovation -= x[GPS_BIAS + 1 + axis]
         innovation, variance = project(nav, innovation)
         variance += noise_variance
         if not (math.isfinite(innovation) and variance > 0.0):
@@ -660,9 +648,9 @@ def use_fix(
     counts[instrument, RUN] = 0
     for axis in range(2):
         innovation = nav.readings[reading + axis] - lever_row(nav, sensors, place, axis)
-        if bias >= 0:
-            nav.scratch[ROW, bias + axis] = 1.0
-            innovation -= x[bias + 1 + axis]
+        if biased:
+            nav.scratch[ROW, GPS_BIAS + axis] = 1.0
+            innovation -= x[GPS_BIAS + 1 + axis]
         innovation, variance = project(nav, innovation)
         absorb(nav, innovation, variance + noise_variance)
     return True

@@ -143,15 +143,7 @@ def navigation_tick(
             drawn = suite.gps.noise_m * rng.standard_normal()
             bias = nav.hidden[slot.GPS_BIAS - slot.GYRO_BIAS + i]
             nav.readings[slot.GPS_FIX + i] = now[i] + arm[i] + bias + drawn
-        used |= use_fix(
-            nav,
-            suite,
-            slot.GPS_USE,
-            part.GPS,
-            slot.GPS_FIX,
-            suite.gps.noise_m * suite.gps.noise_m,
-            slot.GPS_BIAS,
-        )
+        used |= use_fix(nav, suite, slot.GPS_USE, suite.gps.noise_m * suite.gps.noise_m)
     due = suite.usbl_every > 0 and tick % suite.usbl_every == 0
     if due:
         used |= _use_usbl(now, suite, nav, rng)
@@ -159,9 +151,9 @@ def navigation_tick(
         pinged = True
         ping = tick // suite.dvl_every
         measure_dvl(time_s, ping, now, water_velocity_ned, floor, suite, nav, rng)
-        bottom = use_beams(nav, suite, False)
+        bottom = use_beams(nav, suite, slot.OVER_GROUND)
         used |= bottom != 0
-        used |= use_beams(nav, suite, True) != 0
+        used |= use_beams(nav, suite, slot.THROUGH_WATER) != 0
     if used:
         correct(nav)
     if pinged and bottom != 0:
@@ -432,7 +424,7 @@ def _use_usbl(now: Array, sensors: Sensors, nav: NavigationState, rng: np.random
     depth = lever_row(nav, sensors, part.USBL, slot.DOWN_AXIS)
     reach2 = (north - boat[0]) ** 2 + (east - boat[1]) ** 2 + (depth - boat[2]) ** 2
     sigma = math.sqrt(noise2 + slope2 * reach2)
-    return use_fix(nav, sensors, slot.USBL_USE, part.USBL, slot.USBL_FIX, sigma * sigma, -1)
+    return use_fix(nav, sensors, slot.USBL_USE, sigma * sigma)
 
 
 @kernel

@@ -51,11 +51,11 @@ from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.allocation import (
     AXIS_WEIGHTS,
     LEVEL_WEIGHTS,
-    allocate,
     new_allocation,
 )
 from alice_survey.sim.vehicle.dynamics import Body, coriolis_matrix
-from alice_survey.sim.vehicle.fins import Fins, fin_slope, pack_fins
+from alice_survey.sim.vehicle.fins import Fins, fin_slope, pack_fins, write_fin_matrix
+from alice_survey.sim.vehicle.propulsion import thrust_limits
 from alice_survey.sim.vehicle.steady import balance_fins, bisect, min_radius_m
 from alice_survey.sim.vehicle.vehicle import Vehicle
 
@@ -235,8 +235,10 @@ def gains_for(vehicle: Vehicle, speed_mps: float, navigation_hz: float = 5.0) ->
     cruise = np.array([speed_mps, 0.0, 0.0, 0.0, 0.0, 0.0])
     radius_m = min_radius_m(vehicle, speed_mps, STEADY_SHARE) if fins else 0.0
     room = new_allocation(vehicle, np.ones(count), exact=True, axes=np.ones(6))
-    allocate(np.zeros(6), cruise, room)
     matrix, lower, upper = room.matrix, room.lower, room.upper
+    thrust_limits(plant.propulsion, room.health, cruise, lower, upper)
+    if fins:
+        write_fin_matrix(plant.fins, cruise, matrix, count)
     rows = matrix[list(_DEGREE)]
     if fins:
         rolls = np.linalg.matrix_rank(matrix[3:, count:]) == 3

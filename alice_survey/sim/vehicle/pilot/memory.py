@@ -98,7 +98,7 @@ def new_pilot() -> PilotState:
 (
     NONE, TOO_LOW, TOO_STEEP, NO_BOTTOM, NO_DIVE, NO_APPROACH, NO_PROGRESS, LOST_PATH, TOO_DEEP,
     TOO_LONG, NO_NAVIGATION, TOUCHED, THRUSTER_LOST,
-) = range(13)  # fmt: skip
+) = columns(13)  # fmt: skip
 
 REASONS = {
     NONE: "not aborted",

@@ -10,15 +10,8 @@ import pytest
 
 from alice_survey.core.frames import Array
 from missions.values.plan_file import read_plan
+from tests.alice_survey.app.studio import journey_page
 from tests.alice_survey.app.studio.client import ask, serving
-from tests.alice_survey.app.studio.journey_page import (
-    WIDE,
-    begun_page,
-    button,
-    opened,
-    survey_begun,
-    survey_flown,
-)
 from tests.alice_survey.kit.browser import is_accessible
 from tests.missions.follow.dives import rows_along, text_of
 
@@ -85,12 +78,12 @@ def opaque(page: Any) -> int:
     )
 
 
-@pytest.mark.parametrize("size", [WIDE], ids=["1280"])
+@pytest.mark.parametrize("size", [journey_page.WIDE], ids=["1280"])
 def test_a_dive_is_followed_and_its_hole_closed(tmp_path: Path, size: dict[str, int]) -> None:
     reef = tmp_path / "reef"
-    with serving(reef) as server, begun_page(size) as (page, heard):
-        survey_begun(page, server.address, length_m=3.0, width_m=3.0)
-        survey_flown(page)
+    with serving(reef) as server, journey_page.begun_page(size) as (page, heard):
+        journey_page.survey_begun(page, server.address, length_m=3.0, width_m=3.0)
+        journey_page.survey_flown(page)
         plan = read_plan(reef / "plan" / "plan.json")
         dive = SimulatedDive.read(reef)
         first_s, third_s = (float(np.mean(dive.on_lines[line])) for line in (0, 2))
@@ -103,13 +96,13 @@ def test_a_dive_is_followed_and_its_hole_closed(tmp_path: Path, size: dict[str, 
                 with log.open("ab") as file:
                     file.write(part)
 
-        opened(page, "Follow")
+        journey_page.opened(page, "Follow")
         logs = page.get_by_label("Navigation CSV of this workspace")
         logs.wait_for()
         log.write_bytes(text_of(dive.rows[:1]))  # it comes while the page is open
         logs.focus()
         logs.select_option("nav.csv")
-        button(page, "Follow it").click()
+        journey_page.button(page, "Follow it").click()
         come(dive.between(0.01, first_s))
         phase(page, "On line 1")
         page.wait_for_selector("img.follow-coverage")
@@ -130,7 +123,7 @@ def test_a_dive_is_followed_and_its_hole_closed(tmp_path: Path, size: dict[str, 
 
         offered = json.loads(ask(server, "/api/follow/state").text)["proposal"]
         with page.expect_download() as waiting:
-            button(page, "Download missions").click()
+            journey_page.button(page, "Download missions").click()
         assert waiting.value.suggested_filename == "holes.zip"
         # The rest of the plan, and then the lines over the hole.
         come(dive.between(third_s, end_s), rows_along(offered["route_ne"], plan, end_s + 0.5))
@@ -141,6 +134,6 @@ def test_a_dive_is_followed_and_its_hole_closed(tmp_path: Path, size: dict[str, 
         assert float(figure(page, "overlap").split()[0]) > 99.0
         is_accessible(page, tmp_path / "closed.png")
         page.get_by_text("Choose a log", exact=True).click()
-        button(page, "Stop").click()
+        journey_page.button(page, "Stop").click()
         phase(page, "No dive is followed")
         assert heard.complaints == []

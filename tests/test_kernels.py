@@ -1,0 +1,42 @@
+"""How often the kernels of the tutorial's commands are compiled."""
+
+import pickle
+from collections import defaultdict
+from pathlib import Path
+
+import pytest
+
+from tests.small_survey import settings_in, start
+
+pytestmark = pytest.mark.slow
+
+ALLOWED = {
+    # Views of larger arrays, or arrays that may not be written to, next to whole ones.
+    "correlated_fit.whiten.entry": 3,
+    "exact_observations._put.entry": 2,
+    "solve.bilinear.entry": 2,
+    "visibility.look_up": 2,
+    # Literals, places left out, and two widths of numbers.
+    "atlas._raise": 2,
+    "points._way": 2,
+    "range_shift.slopes_of": 2,
+    "surface_points.sorted_ranks": 2,
+}
+"""Numbers of versions of kernels that have more than one, by the reason."""
+
+
+def test_the_kernels_of_a_survey_have_one_version_each(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each combination of types of arguments is compiled for itself: literals and flags count."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kernels"))
+    assert start(settings_in(tmp_path / "survey"), threads=1).wait() == 0
+
+    versions: defaultdict[str, set[object]] = defaultdict(set)
+    for index in (tmp_path / "kernels").rglob("*.nbi"):
+        with index.open("rb") as file:
+            _, (_, kept) = pickle.load(file), pickle.load(file)  # noqa: S301  our own
+        versions[index.name.rpartition("-")[0]].update(kept)
+    several = {name: len(kinds) for name, kinds in versions.items() if len(kinds) > 1}
+    assert several == ALLOWED
+    assert len(versions) > 200
