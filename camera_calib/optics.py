@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from alice_survey.core.frames import Array
+from camera_calib.lenses import opencv
 from camera_calib.lenses.fisheye import FisheyeLens, fisheye_pixels, fisheye_rays, fisheye_slopes
-from camera_calib.lenses.opencv import OpenCVLens, opencv_pixels, opencv_rays, opencv_slopes
+from camera_calib.lenses.opencv import OpenCVLens
 from camera_calib.lenses.values import LensValues
 from camera_calib.ports.dome import DomePort, dome_leave, dome_rays, dome_slopes
 from camera_calib.ports.flat import FlatPort, flat_leave, flat_rays, flat_slopes
@@ -24,10 +25,11 @@ _BETWEEN = 1.17
 """Between the ratio of focal lengths of a dome, 1, and that of a flat port, the water's index."""
 _Kernel = Callable[..., Any]
 _OF_LENS: dict[type[LensValues], tuple[_Kernel, _Kernel, _Kernel]] = {
-    OpenCVLens: (opencv_pixels, opencv_rays, opencv_slopes),
+    OpenCVLens: (opencv.opencv_pixels, opencv.opencv_rays, opencv.opencv_slopes),
     FisheyeLens: (fisheye_pixels, fisheye_rays, fisheye_slopes),
 }
 """Pixels of rays in air, the inverse, and pixels with their slopes."""
+_OF_PINHOLE = opencv.pinhole_pixels, opencv.pinhole_rays, opencv.pinhole_slopes
 _OF_PORT: dict[type[PortValues], tuple[_Kernel, _Kernel, _Kernel]] = {
     NoPort: (bare_rays, bare_leave, bare_slopes),
     FlatPort: (flat_rays, flat_leave, flat_slopes),
@@ -49,6 +51,11 @@ def contradicting_port(focal_ratio: float, given: str) -> str | None:
     return likely if likely != given and FlatPort.shape in (likely, given) else None
 
 
+def _of_lens(lens: LensValues) -> tuple[_Kernel, _Kernel, _Kernel]:
+    is_pinhole = isinstance(lens, OpenCVLens) and not lens.distorts
+    return _OF_PINHOLE if is_pinhole else _OF_LENS[type(lens)]
+
+
 def _blocks(count: int) -> Iterator[tuple[slice, int]]:
     """Parts of so many rows, and how many each has."""
     for first in range(0, count, _BLOCK):
@@ -62,7 +69,7 @@ def project(points: Array, lens: LensValues, port: PortValues) -> Array:
     air, turns = np.empty((size, 3)), np.empty(size)
     for part, count in _blocks(len(points)):
         _OF_PORT[type(port)][0](points[part], port.values, air[:count], turns)
-        _OF_LENS[type(lens)][0](air[:count], lens.values, pixels[part])
+        _of_lens(lens)[0](air[:count], lens.values, pixels[part])
     return pixels
 
 
@@ -71,7 +78,7 @@ def unproject(pixels: Array, lens: LensValues, port: PortValues) -> tuple[Array,
     points, directions = np.empty((2, len(pixels), 3))
     air = np.empty((min(len(pixels), _BLOCK), 3))
     for part, count in _blocks(len(pixels)):
-        _OF_LENS[type(lens)][1](pixels[part], lens.values, air[:count])
+        _of_lens(lens)[1](pixels[part], lens.values, air[:count])
         _OF_PORT[type(port)][1](air[:count], port.values, points[part], directions[part])
     return points, directions
 
@@ -84,7 +91,7 @@ def project_jacobian(
     Returns:
         (N, 2), (N, 2, 3) and (N, 2, P), of which the lens's parameters come first.
     """
-    count, of_lens, of_port = len(points), _OF_LENS[type(lens)], _OF_PORT[type(port)]
+    count, of_lens, of_port = len(points), _of_lens(lens), _OF_PORT[type(port)]
     pixels, by_point, by_ray = (
         np.empty((count, 2)),
         np.empty((count, 2, 3)),

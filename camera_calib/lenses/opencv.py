@@ -66,6 +66,11 @@ class OpenCVLens(LensValues):
         terms = np.array([getattr(self, name) for name in self.parameters])
         return np.append(terms, fold(terms[4:]))
 
+    @cached_property
+    def distorts(self) -> bool:
+        """Whether any of its coefficients counts."""
+        return any(getattr(self, name) for name in COEFFICIENTS)
+
 
 def fold(k: Array) -> float:
     """Square of the tangent in air at which radial distortion turns back; inf if it never does.
@@ -265,3 +270,37 @@ def opencv_slopes(rays: Array, lens: Array, pixels: Array, by_ray: Array, by_len
             out[9], out[10], out[11] = inward * one, inward * two, inward * three
             out[12 + 2 * row], out[13 + 2 * row] = focal * r2, focal * r2 * r2
             out[12 + 2 * across], out[13 + 2 * across] = 0.0, 0.0
+
+
+def pinhole_pixels(rays: Array, lens: Array, pixels: Array) -> None:
+    """As `opencv_pixels`, of a lens without distortion: nothing is compiled."""
+    ahead = np.where(rays[:, 2:] > 0.0, rays[:, 2:], np.nan)
+    pixels[:] = lens[:2] * (rays[:, :2] / ahead) + lens[2:4]
+
+
+def pinhole_rays(pixels: Array, lens: Array, rays: Array) -> None:
+    """As `opencv_rays`, of a lens without distortion."""
+    rays[:, :2], rays[:, 2] = (pixels - lens[2:4]) / lens[:2], 1.0
+    rays /= np.sqrt(rays[:, 0] ** 2 + rays[:, 1] ** 2 + 1.0)[:, None]
+
+
+def pinhole_slopes(rays: Array, lens: Array, pixels: Array, by_ray: Array, by_lens: Array) -> None:
+    """As `opencv_slopes`, of a lens without distortion."""
+    ahead = np.where(rays[:, 2] > 0.0, rays[:, 2], np.nan)
+    u, v = tangents = rays[:, :2].T / ahead
+    r2 = u * u + v * v
+    terms = np.stack([r2, r2 * r2, r2 * (r2 * r2)], axis=1)
+    by_ray[:], by_lens[:] = (0.0 * u)[:, None, None], (0.0 * u)[:, None, None]  # or NaN
+    for row, tangent in enumerate(tangents):
+        focal, across, out = lens[row], 1 - row, by_lens[:, row]
+        outward = focal * tangent
+        pixels[:, row] = outward + lens[2 + row]
+        by_ray[:, row, row] = focal / ahead
+        by_ray[:, row, 2] = -(tangent * by_ray[:, row, row])
+        out[:, row] = tangent
+        out[:, 2 + row] += 1.0
+        out[:, [4, 5, 8]] = outward[:, None] * terms
+        out[:, 9:12] = -out[:, [4, 5, 8]]
+        out[:, 6 + row] = focal * 2.0 * u * v
+        out[:, 6 + across] = focal * (r2 + 2.0 * tangent * tangent)
+        out[:, 12 + 2 * row], out[:, 13 + 2 * row] = focal * r2, focal * r2 * r2

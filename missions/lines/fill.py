@@ -475,7 +475,7 @@ def _patches(
         for k in range(count):
             windows[k, 0] = cuts[near_cuts[0, i] + k, 1] - half_along
             windows[k, 1] = cuts[near_cuts[0, i] + k, 2] + half_along
-        count = unite(windows, 0, count)
+        count = unite(windows, np.int64(0), count)
         k = 0
         for j in range(begins[i], begins[i] + counts[i]):
             while k < count and windows[k, 1] <= inside[j, 0]:
@@ -505,7 +505,7 @@ def _patches(
                                     marks = np.concatenate((marks, np.empty_like(marks)))
                                 marks[size, 0] = mark
                                 size += 1
-                sort_pairs(marks, 0, size)
+                sort_pairs(marks, np.int64(0), np.int64(size))
                 for m in range(size - 1):
                     length = marks[m + 1, 0] - marks[m, 0]
                     if length <= _TINY_M:
