@@ -17,12 +17,11 @@ ALLOWED = {
     "solve.bilinear.entry": 2,
     "visibility.look_up": 2,
     # Literals, places left out, and two widths of numbers.
-    "atlas._raise": 2,
     "points._way": 2,
     "range_shift.slopes_of": 2,
     "surface_points.sorted_ranks": 2,
 }
-"""Numbers of versions of kernels that have more than one, by the reason."""
+"""Most versions of kernels that may have more than one, by the reason."""
 
 
 def test_the_kernels_of_a_survey_have_one_version_each(
@@ -37,6 +36,6 @@ def test_the_kernels_of_a_survey_have_one_version_each(
         with index.open("rb") as file:
             _, (_, kept) = pickle.load(file), pickle.load(file)  # noqa: S301  our own
         versions[index.name.rpartition("-")[0]].update(kept)
-    several = {name: len(kinds) for name, kinds in versions.items() if len(kinds) > 1}
-    assert several == ALLOWED
+    counts = {name: len(kinds) for name, kinds in versions.items()}
+    assert not {name: n for name, n in counts.items() if n > ALLOWED.get(name, 1)}
     assert len(versions) > 200
