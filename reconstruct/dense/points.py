@@ -240,7 +240,7 @@ def gather(
     colours = np.empty((count, 3), np.uint8)
     sigmas = np.empty(count, np.float32)
     for i in range(count):
-        row, column = np.int64(pixels[i, 0]), np.int64(pixels[i, 1])
+        row, column = int(pixels[i, 0]), int(pixels[i, 1])
         sigmas[i] = sigma[row, column]
         place = (top + row + 0.5) / whole_height * (factors.shape[0] - 1)
         node_row = min(int(place), factors.shape[0] - 2)

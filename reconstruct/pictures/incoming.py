@@ -607,15 +607,15 @@ def with_masks(entries: Sequence[Incoming], masks: Path | None, *, stereo: bool)
     for entry in entries:
         name, stem = entry.source.name.lower(), entry.source.stem.lower()
         ends = [end for kind in KINDS.values() for end in kind]
-        wanted = [f"{name}.png", f"{name}_mask.png", *(f"{stem}_mask{end}" for end in ends)]
+        names = [f"{name}.png", f"{name}_mask.png", *(f"{stem}_mask{end}" for end in ends)]
         folders = [entry.source.parent]
         if masks is not None:
-            wanted = [f"{stem}.png", *wanted, *(f"{stem}{end}" for end in ends)]
+            names = [f"{stem}.png", *names, *(f"{stem}{end}" for end in ends)]
             folders = [masks / entry.camera, *([] if stereo else [masks])]
         for folder in set(folders) - set(files):
             inside = sorted(folder.iterdir()) if folder.is_dir() else []
             files[folder] = {path.name.lower(): path for path in inside}
-        there = (files[folder].get(one) for folder in folders for one in wanted)
+        there = (files[folder].get(one) for folder in folders for one in names)
         mask = next((one for one in there if one is not None), None)
         if mask is not None:
             read_mask(mask, (entry.facts.width_px, entry.facts.height_px))

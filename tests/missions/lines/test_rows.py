@@ -1,3 +1,5 @@
+from typing import Any
+
 import numpy as np
 import pytest
 import shapely
@@ -64,10 +66,9 @@ def test_a_row_may_follow_the_edge_of_the_allowed_area_on_either_side() -> None:
     assert counts.tolist() == [0, 0]
 
 
-def lay(
-    survey: shapely.Geometry, allowed: shapely.Geometry, **changes: float
-) -> tuple[Array, Array]:
-    wanted = {"half_m": 0.5, "overhang_m": 0.2, "step_m": 0.5, "min_steps": 1} | changes
+def lay(survey: shapely.Geometry, allowed: shapely.Geometry, **changes: Any) -> tuple[Array, Array]:
+    wanted: dict[str, Any] = {"half_m": 0.5, "overhang_m": 0.2, "step_m": 0.5, "min_steps": 1}
+    wanted |= changes
     offsets = np.array([0.5])
     return lay_rows(turned(survey, 0.0), turned(allowed, 0.0), offsets, *wanted.values())
 

@@ -535,7 +535,7 @@ def use_heading(nav: NavigationState, sensors: Sensors) -> bool:
 
 
 @kernel
-def use_beams(nav: NavigationState, sensors: Sensors, through_water: bool) -> int:
+def use_beams(nav: NavigationState, sensors: Sensors, through_water: bool | np.bool_) -> int:
     """Weigh a ping's velocities along the beams, over ground or through the water.
 
     Args:
