@@ -1,6 +1,5 @@
 """Faults put into the code one at a time, and whether the tests of every day notice.
 
-    python -m benchmarks.mutants --draw 100          # once: writes benchmarks/mutants.json
     python -m benchmarks.mutants --work FOLDER [--tree CHECKOUT]
 
 A mutant is known by its function's name and the text that it changes, so that it survives moves of
@@ -18,14 +17,14 @@ import re
 import shutil
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Iterator
-from hashlib import blake2b
-from itertools import groupby
 from pathlib import Path
 
 from tests.structure import PACKAGES
 
 DRAWN = Path(__file__).with_name("mutants.json")
+"""A hundred, drawn by the digests of the names of functions and of changes."""
 _MAX_S = 900.0
 _SWAPS: dict[type, type] = {
     ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq,
@@ -51,9 +50,7 @@ def changes(function: ast.FunctionDef) -> Iterator[tuple[ast.expr, str]]:
         new = copy.deepcopy(node)
         if isinstance(new, ast.Compare) and type(new.ops[0]) in _SWAPS:
             new.ops[0] = _SWAPS[type(new.ops[0])]()
-        elif (
-            isinstance(new, ast.BinOp | ast.BoolOp) and type(new.op) in _SWAPS and not has_text(new)
-        ):
+        elif isinstance(new, ast.BinOp | ast.BoolOp) and type(new.op) in _SWAPS:
             new.op = _SWAPS[type(new.op)]()
         elif isinstance(new, ast.Constant) and isinstance(new.value, float) and new.value:
             new.value *= 1.1
@@ -63,28 +60,6 @@ def changes(function: ast.FunctionDef) -> Iterator[tuple[ast.expr, str]]:
             continue
         assert isinstance(node, ast.expr)
         yield node, f"({ast.unparse(new)})"
-
-
-def has_text(node: ast.expr) -> bool:
-    """Whether text is in it: it would be a path or a sentence, and end in a type error."""
-    return any(isinstance(one, ast.Constant | ast.JoinedStr) and not isinstance(
-        getattr(one, "value", ""), int | float) for one in ast.walk(node))  # fmt: skip
-
-
-def draw(tree: Path, count: int) -> list[dict[str, str]]:
-    """Functions by the digest of their names, and of each one change."""
-
-    def key(*texts: object) -> bytes:
-        return blake2b("".join(map(str, texts)).encode()).digest()
-
-    drawn: list[dict[str, str]] = []
-    named = [(path.relative_to(tree).as_posix(), name, one) for path, name, one in functions(tree)]
-    for module, name, function in sorted(named, key=lambda one: key(*one[:2])):
-        found = sorted(changes(function), key=lambda one: key(name, one[1]))
-        if found and len(drawn) < count:
-            before = ast.unparse(found[0][0])
-            drawn.append({"function": name, "in": module, "from": before, "to": found[0][1]})
-    return drawn
 
 
 def mutated(tree: Path, mutant: dict[str, str]) -> tuple[Path, str] | None:
@@ -137,54 +112,36 @@ def noticed(tree: Path, work: Path, mutant: dict[str, str]) -> str:
     changed = work / "tree" / found[0].relative_to(tree)
     changed.unlink()  # a hard link
     changed.write_text(found[1])
-    command = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-x",
-        "-q",
-        "-m",
-        "not slow",
-        "-p",
-        "no:cacheprovider",
-    ]
     names = [str(Path(one).relative_to(tree)) for one in tests_of(tree, found[0])]
+    call = [sys.executable, *"-m pytest -x -q -p no:cacheprovider -m".split(), "not slow", *names]
     try:
-        ended = subprocess.run(
-            [*command, *names], cwd=work / "tree", capture_output=True, timeout=_MAX_S
-        )
+        ended = subprocess.run(call, cwd=work / "tree", capture_output=True, timeout=_MAX_S)
     except subprocess.TimeoutExpired:
         return "noticed"
     return "survived" if ended.returncode in (0, 5) else "noticed"
 
 
 def main() -> None:
-    """Draw, or run what is left to run."""
+    """Run what is left to run."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("--draw", type=int)
-    parser.add_argument("--work", type=Path)
+    parser.add_argument("--work", type=Path, required=True)
     parser.add_argument("--tree", type=Path, default=Path())
     options = parser.parse_args()
     tree = options.tree.resolve()
-    if options.draw:
-        DRAWN.write_text(json.dumps(draw(tree, options.draw), indent=0) + "\n")
-        return
     options.work.mkdir(parents=True, exist_ok=True)
-    for beside in (one for one in (tree.parent / "shared",) if one.exists()):
-        (options.work / "shared").unlink(missing_ok=True)
-        (options.work / "shared").symlink_to(beside)
+    if not (link := options.work / "shared").is_symlink():
+        link.symlink_to(tree.parent / "shared")
     record = options.work / "mutants.jsonl"
-    lines = record.read_text().splitlines() if record.exists() else []
-    done = [json.loads(line) for line in lines]
-    known = [{key: one[key] for key in ("function", "in", "from", "to")} for one in done]
+    record.touch()
+    done = [json.loads(line) for line in record.read_text().splitlines()]
+    known = [one | {"state": None} for one in done]
     for mutant in json.loads(DRAWN.read_text()):
-        if mutant not in known:
+        if mutant | {"state": None} not in known:
             done.append(mutant | {"state": noticed(tree, options.work, mutant)})
             with record.open("a") as file:
                 file.write(json.dumps(done[-1]) + "\n")
             print(done[-1]["state"], mutant["in"], mutant["function"], flush=True)
-    states = sorted(one["state"] for one in done)
-    print({state: len(list(ones)) for state, ones in groupby(states)})
+    print(Counter(one["state"] for one in done))
 
 
 if __name__ == "__main__":
