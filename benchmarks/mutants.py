@@ -113,7 +113,8 @@ def noticed(tree: Path, work: Path, mutant: dict[str, str]) -> str:
     changed.unlink()  # a hard link
     changed.write_text(found[1])
     names = [str(Path(one).relative_to(tree)) for one in tests_of(tree, found[0])]
-    call = [sys.executable, *"-m pytest -x -q -p no:cacheprovider -m".split(), "not slow", *names]
+    options = ["-x", "-q", "-p", "no:cacheprovider", "-m", "not slow"]
+    call = [sys.executable, "-m", "pytest", *options, *names]
     try:
         ended = subprocess.run(call, cwd=work / "tree", capture_output=True, timeout=_MAX_S)
     except subprocess.TimeoutExpired:
