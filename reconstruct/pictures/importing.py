@@ -491,7 +491,7 @@ def import_images(
     frame_overlap = DEFAULT_OVERLAP if overlap is None else overlap
     stage = Stage(
         name="images",
-        version=5,
+        version=6,
         command="import-images",
         settings={
             "folders": len(folders),

@@ -33,10 +33,10 @@ from alice_survey.core.artefacts import need_stage, write_csv
 from alice_survey.core.contents import as_line, one_line, ordinary_file, xml_root
 from alice_survey.core.errors import ReconstructionError, WorkspaceError, warn, why
 from alice_survey.core.executor import SERIAL, Executor
-from alice_survey.core.frames import Array
-from alice_survey.core.manifest import read_manifest
+from alice_survey.core.frames import Array, Datum
+from alice_survey.core.manifest import ImageRecord, read_manifest
 from alice_survey.core.records import MappingRecord, RegistrationRecord, ScaleRecord
-from reconstruct.pictures.files import list_names, safe_name
+from reconstruct.pictures.files import list_names, read_header, safe_name
 from reconstruct.pictures.undistorted import read_colour
 from reconstruct.placing.control_points import (
     CONTROL_FILE,
@@ -348,6 +348,8 @@ def _finite(element: ET.Element, key: str, name: str) -> float:
 _UTM = re.compile(r"WGS84\s+UTM\s+(\d{1,2})\s*([NS])", re.IGNORECASE)
 _SYSTEM = re.compile(r"\s*(EPSG:|\+proj|WGS84\b)", re.IGNORECASE)
 _MIN_FIELDS = 6
+_CHECK = "CHK-"
+"""How the names of ODM's check points begin."""
 
 
 def read_gcp_list(text: str) -> ForeignControl:
@@ -385,7 +387,8 @@ def read_gcp_list(text: str) -> ForeignControl:
             name = fields[_MIN_FIELDS]
         else:
             name = names.setdefault((x, y, z), f"P{len(names) + 1}")
-        point = replace(place_of(x, y), name=name, height_m=z)
+        use: Use = "check" if name.upper().startswith(_CHECK) else "control"
+        point = replace(place_of(x, y), name=name, height_m=z, use=use)
         first = points.setdefault(name, point)
         if first.place != point.place and not math.isnan(z):
             raise ValueError(f"line {number}: point {as_line(name)} has another place than before")
@@ -458,7 +461,8 @@ def import_control(
         raise WorkspaceError(
             f"{path}: states no accuracy of {as_line(unsure)}: give --sigma, in metres"
         )
-    names = [record.image for record in read_manifest(images / "manifest.csv")]
+    records = read_manifest(images / "manifest.csv")
+    names = [record.image for record in records]
     picks, lost = _match_pictures(found.picks, {p.name for p in points} | ends, names)
     lost_names = f"{_name_some(lost)}: not in {images}, or there more than once"
     if not picks:
@@ -468,6 +472,8 @@ def import_control(
         )
     if lost:
         warn(f"{path}: {lost_names}; picks in them are left out")
+    _compare_places(path, points, records)
+    _compare_sizes(path, picks, images)
     write_control(targets[0], points, lengths)
     write_picks(targets[1], picks)
     checks = [one.use for one in every].count("check")
@@ -475,6 +481,75 @@ def import_control(
     bars = f", {len(lengths)} scale bar{'s' * (len(lengths) > 1)}" if lengths else ""
     pictures = len({pick.image for pick in picks})
     return f"{len(points)} points{bars}{held}, {len(picks)} picks in {pictures} pictures"
+
+
+_FAR_M, _FAR_SHARE = 100.0, 3.0
+"""Control is that far from pictures, and so many times their extent, or in another place."""
+_DEEP_M, _SIGMAS, _ABOVE_M = 20.0, 5.0, 0.5
+
+
+def _compare_places(
+    path: Path, points: Sequence[KnownPoint], records: Sequence[ImageRecord]
+) -> None:
+    """Warn where points are not where the navigation of the pictures is, and of the usual cause."""
+    geodetic = [p for p in points if p.geodetic]
+    seen = np.array([[r.latitude_deg, r.longitude_deg] for r in records if r.has_horizontal])
+    if geodetic and len(seen):
+        middle = np.median(seen, axis=0)
+        datum = Datum(*map(float, middle))
+
+        def metres(lat_lon: Array) -> Array:
+            on_earth = np.clip(lat_lon, [-90, -180], [90, 180])
+            whole = np.column_stack([on_earth, np.zeros(len(lat_lon))])
+            return np.asarray(np.linalg.norm(datum.ned_from_geodetic(whole)[:, :2], axis=1))
+
+        at = np.array([[p.latitude_deg, p.longitude_deg] for p in geodetic])
+        far, extent_m = metres(at), float(metres(seen).max())
+        far_off = far > _FAR_M + _FAR_SHARE * extent_m
+        if far_off.any():
+            close = metres(at[:, ::-1]) < _FAR_M + _FAR_SHARE * extent_m
+            cause = (
+                "latitude and longitude seem exchanged" if (far_off & close).any()
+                else "check their coordinate system and its zone"
+            )  # fmt: skip
+            warn(
+                f"{path}: {far_off.sum()} points lie {np.median(far[far_off]) / 1e3:,.1f} km from "
+                f"the pictures ({middle[0]:.5f}, {middle[1]:.5f}): {cause}"
+            )
+    depths = np.array([p.depth_m for p in points if not math.isnan(p.depth_m)])
+    taken = np.array([r.depth_m for r in records])
+    if not len(depths) or not np.isfinite(taken).any():
+        return
+    depth, picture = float(np.median(depths)), float(np.nanmedian(taken))
+    sigmas = np.array([r.sigma_depth_m for r in records])
+    sigma = float(np.nanmax(sigmas)) if np.isfinite(sigmas).any() else 0.0
+    off = abs(depth - picture) > _DEEP_M + _SIGMAS * sigma
+    flipped = abs(depth + picture) < abs(depth - picture) / 2
+    if (off or (depth < -_ABOVE_M < _ABOVE_M < picture)) and flipped:
+        warn(
+            f"{path}: points are {depth:.1f} m deep and pictures {picture:.1f} m: heights are "
+            "positive up, depths are to be given as negative heights"
+        )
+    elif off:
+        warn(
+            f"{path}: points are {depth:.1f} m deep and pictures {picture:.1f} m (sigma "
+            f"{sigma:.1f} m): check what the heights count from (--heights)"
+        )
+
+
+def _compare_sizes(path: Path, picks: Sequence[Pick], images: Path) -> None:
+    """Warn of picks that lie outside of their pictures."""
+    sizes = {name: read_header(images / name) for name in {pick.image for pick in picks}}
+    at = np.array([[p.x_px + 0.5, p.y_px + 0.5] for p in picks])
+    size = np.array([[sizes[p.image].width_px, sizes[p.image].height_px] for p in picks])
+    outside = (size > 0).all(axis=1) & ((at < 0) | (at > size)).any(axis=1)
+    if outside.any():
+        factor = float((at / np.maximum(size, 1)).max())
+        copies = f": are they of larger copies, at least {factor:.1f} times?" if factor > 1 else ""
+        warn(
+            f"{path}: {outside.sum()} of {len(picks)} picks lie outside of their pictures of "
+            f"{size[outside][0, 0]} x {size[outside][0, 1]} pixels{copies}"
+        )
 
 
 def _first_above_0(*values: float | None) -> float:

@@ -34,6 +34,7 @@ matches alone says how well they agree; the covariance of the point holds both (
 import csv
 import io
 import math
+import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
@@ -295,6 +296,7 @@ def _point(row: dict[str, str], name: str, use: Use, sigma: float) -> KnownPoint
     return KnownPoint(name=name, use=use, **at)
 
 
+_POLE_DEG = 90.0
 PlaceOf = Callable[[float, float], KnownPoint]
 """A nameless point from x (easting or longitude) and y in the coordinates of a file."""
 
@@ -311,7 +313,12 @@ def coordinates(system: str) -> PlaceOf:
     try:
         crs = CRS.from_user_input(system)
     except CRSError:
-        raise ValueError(f"{as_line(system)!r} is no coordinate system that is known") from None
+        zone = re.search(r"UTM\s*(\d{1,2})\s*([C-X])?", system, re.IGNORECASE)
+        number, north = (int(zone[1]), (zone[2] or "N").upper() >= "N") if zone else (0, True)
+        hint = f"; EPSG:{(32600 if north else 32700) + number}?" if zone else ""
+        raise ValueError(
+            f"{as_line(system)!r} is no coordinate system that is known{hint}"
+        ) from None
     if crs.is_engineering:  # a local grid, metres
         return lambda x, y: KnownPoint(name="", north_m=y, east_m=x)
     to_wgs84 = Transformer.from_crs(crs.to_2d(), 4326, always_xy=True)
@@ -321,6 +328,8 @@ def coordinates(system: str) -> PlaceOf:
             longitude, latitude = to_wgs84.transform(x, y, errcheck=True)
         except ProjError:
             raise ValueError(f"{x}, {y} is not a place in {as_line(crs.name)}") from None
+        if not abs(latitude) <= _POLE_DEG:
+            raise ValueError(f"latitude {latitude:g}: are latitude and longitude exchanged?")
         return KnownPoint(name="", latitude_deg=float(latitude), longitude_deg=float(longitude))
 
     return place

@@ -2,16 +2,18 @@
 
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
 from alice_survey.core.artefacts import StaleError, write_json
 from alice_survey.core.errors import WorkspaceError, collected_by, keep_warnings
 from alice_survey.core.frames import Array
-from alice_survey.core.manifest import ImageRecord, write_manifest
+from alice_survey.core.manifest import ImageRecord, read_manifest, write_manifest
 from reconstruct.placing.control_command import import_control
 from reconstruct.placing.control_points import (
     Pick,
@@ -189,6 +191,8 @@ def test_pictures_of_a_rig_are_told_apart_by_their_folder(tmp_path: Path) -> Non
         ("EPSG:4326\n-91 46 1 10 20 DJI_1.jpg A\n", "--sigma"),
         ("EPSG:4326\n-91 46 1 10 DJI_1.jpg\n", "line 2: 5 fields"),
         ("EPSG:999999\n-91 46 1 10 20 DJI_1.jpg\n", "no coordinate system"),
+        ("EPSG:4326\n46 -91 1 10 20 DJI_1.jpg\n", "exchanged"),
+        ("WGS84 UTM 30U\n683000 3633500 1 10 20 DJI_1.jpg\n", "EPSG:32630"),
         (
             "EPSG:4326\n-91 46 1 10 20 x.jpg A\n-91 47 1 1 2 x.jpg A\n",
             "line 3: point A has another",
@@ -320,3 +324,37 @@ def test_control_rows_are_replaced_by_kind_and_name(tmp_path: Path) -> None:
     assert known.points[0].depth_m == 10.0 and known.lengths[0].length_m == 0.5
     save_control(path, token, [], [("point", "1")])
     assert read_control(path).points == () and len(read_control(path).lengths) == 1
+
+
+@pytest.mark.parametrize(
+    ("place", "pixel", "said"),
+    [
+        ("-71.00001 46.00001 -6.0", (20, 30), ""),
+        ("46 -71 -6.0", (20, 30), "exchanged"),
+        ("-70 46 -6.0", (20, 30), "zone"),
+        ("-71 46 5.5", (20, 30), "positive up"),
+        ("-71 46 -260", (20, 30), "--heights"),
+        ("-71 46 -6.0", (410, 230), "6.4"),
+    ],
+)  # fmt: skip
+def test_control_is_compared_with_the_pictures(
+    tmp_path: Path, place: str, pixel: tuple[int, int], said: str
+) -> None:
+    names = ("left/1.png", "left/2.png")
+    workspace = workspace_of(tmp_path / "w", names)
+    records = [
+        replace(r, latitude_deg=46.0, longitude_deg=-71.0, depth_m=5.0, sigma_depth_m=1.0)
+        for r in read_manifest(workspace / "images" / "manifest.csv")
+    ]
+    write_manifest(workspace / "images" / "manifest.csv", records)
+    (workspace / "images" / "left").mkdir()
+    for name in names:
+        cv2.imwrite(str(workspace / "images" / name), np.zeros((48, 64), np.uint8))
+    path = tmp_path / "gcp_list.txt"
+    rows = [f"{place} {pixel[0]} {pixel[1]} {number}.png CHK-A" for number in (1, 2)]
+    path.write_text("\n".join(["EPSG:4326", *rows]))
+    warnings: list[str] = []
+    with collected_by(lambda _, text: warnings.append(text)):
+        import_control(workspace, path, sigma_m=0.1)
+    assert [said in text for text in warnings] == [True] * bool(said)
+    assert [p.use for p in read_control(workspace / "control.csv").points] == ["check"]
