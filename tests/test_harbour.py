@@ -275,6 +275,7 @@ def test_fish_of_the_judge_are_those_of_the_renderer() -> None:
     assert abs(int(shown.sum()) - int(found.sum())) < 0.02 * shown.sum()
 
 
+@pytest.mark.slow
 def test_masks_are_judged_by_what_moves_and_by_shadows(tmp_path: Path) -> None:
     station = fishy_station()
     task = MaskTask(masks=tmp_path, planned=QUICK, scale=12, name="left", station=station)

@@ -616,7 +616,7 @@ def read_csv(
         path: the file, in UTF-8, UTF-16 with its mark or Windows-1252; its cells apart by commas,
             or by semicolons or tabs with commas or points in numbers.
         required: columns that must be there.
-        exact: keep spaces at the ends of cells, which names of files may have.
+        exact: keep spaces at the ends of cells, which names of files may have; UTF-8 only.
         fault: type of the error.
 
     Returns:
@@ -670,7 +670,7 @@ def _cells(path: Path, *, exact: bool, fault: type[AliceError]) -> Iterator[tupl
     """Numbers of lines and their cells, in any encoding and with any separator that tables have."""
     with _csv_faults(path, fault):
         with ordinary_file(path).open("rb") as raw:
-            encoding = _encoding_of(raw.read(_LOOKED_AT))
+            encoding = "utf-8-sig" if exact else _encoding_of(raw.read(_LOOKED_AT))
         with path.open(newline="", encoding=encoding) as file:
             first = file.readline()
             named = re.fullmatch(r"sep=(.)\s*", first, re.IGNORECASE)

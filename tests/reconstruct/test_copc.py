@@ -145,6 +145,7 @@ def _cells(points: np.ndarray, edge: float, info: object) -> tuple[np.ndarray, n
     return cells, counts
 
 
+@pytest.mark.slow
 def test_workers_make_the_same_bytes(tmp_path: Path):
     parts = np.array_split(floor(45.0, 24.0), 7)  # six cubes
     files = []
