@@ -13,7 +13,7 @@ WORK ?= build/benchmarks
 
 help:
 	@echo "make demo    plan, fly, image, reconstruct and score a small survey into $(WORKSPACE)/"
-	@echo "make test    run the tests of every day: about 13 CPU minutes on a busy machine"
+	@echo "make test    run the tests of every day: 10 minutes on two busy cores, kernels compiled on the way"
 	@echo "make test-all  run these and the slow ones: the loop, kills, docs, browser, fuzzing, Monte Carlo"
 	@echo "make bench   run all benchmarks, for hours; table, logs and workspaces go into $(WORK)/"
 	@echo "make docs    build the site of docs/ into build/site/"

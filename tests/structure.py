@@ -30,13 +30,13 @@ PACKAGES = ("alice_survey", "camera_calib", "missions", "reconstruct")
 WORDS = Path(__file__).with_name("structure_words.toml")
 """Words that are not used, and where each of them counts."""
 BOUNDS = {
-    "code lines of the packages": 69_770,  # 69,438, and a part of the reserve of 2,000
-    "code lines of the tests": 48_723,  # goal: 48_000
+    "code lines of the packages": 70_100,  # 69,438, and a part of the reserve of 2,000
+    "code lines of the tests": 48_870,  # 48,310, and a part of the reserve of 4,000
     "code lines of the benchmarks": 8_000,
     "lines of our own JavaScript": 4_900,
     "modules": 393,
     "modules with a single importer": 72,
-    "kernels": 241,
+    "kernels": 232,
     "commands": 36,
     "options of commands": 345,
     "settings": 125,
