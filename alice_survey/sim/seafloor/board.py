@@ -147,7 +147,7 @@ def _uneven_light(camera: Camera) -> Floats:
     total = np.zeros(x.size, dtype=np.float32)
     for lattice in (0.7, 0.3):
         part = np.empty(x.size, dtype=np.float32)
-        noise(x.ravel(), y.ravel(), np.zeros(x.size), lattice, 99, part)
+        noise(x.ravel(), y.ravel(), np.zeros(x.size), lattice, np.uint32(99), part)
         total += np.float32(0.04) * part
     return total.reshape(x.shape)
 

@@ -362,7 +362,7 @@ def simulate(
     """
     from alice_survey.core.executor import progress
 
-    note_compiling(_fly_ticks, "the vehicle's model, once: this takes about a minute")
+    note_compiling(_fly_ticks, "the vehicle's model, once: this takes about half a minute")
     chunks: list[TickRows] = []
     total = math.ceil((expected_s or max_s) / TICK_S / _CHUNK_TICKS)
     found: list[Failure] = []
