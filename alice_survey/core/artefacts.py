@@ -613,8 +613,8 @@ def read_csv(
     """Read a CSV file with a header.
 
     Args:
-        path: the file, in UTF-8, UTF-16 with its mark or Windows-1252; its cells apart by commas,
-            or by semicolons or tabs with commas or points in numbers.
+        path: the file, in UTF-8, UTF-16 with its mark or Windows-1252; cells are separated by
+            commas, or by semicolons or tabs, and numbers may then have decimal commas.
         required: columns that must be there.
         exact: keep spaces at the ends of cells, which names of files may have; UTF-8 only.
         fault: type of the error.
@@ -646,7 +646,7 @@ def stream_csv(
     if missing:
         raise fault(f"{path}: column {missing[0]} is missing; it has {as_line(', '.join(names))}")
     if twice:
-        raise fault(f"{path}: column {as_line(twice[0])} stands twice")
+        raise fault(f"{path}: column {as_line(twice[0])} occurs twice")
 
     def rows() -> Iterator[tuple[int, dict[str, str]]]:
         for line, cells in lines:

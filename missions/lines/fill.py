@@ -375,8 +375,8 @@ def unseen(
     # Places between the outer sides of two cut rows' swaths that neither sees have no patches.
     strips = _strips(np.unique(sides), low, high, finest_m)
     seen = pattern.half_across_m, pattern.half_along_m
-    least = pattern.passes, pattern.passes * pattern.pictures
-    return _seek(survey, strips, offsets, pieces, cuts, seen, least, finest_m)
+    minimum = pattern.passes, pattern.passes * pattern.pictures
+    return _seek(survey, strips, offsets, pieces, cuts, seen, minimum, finest_m)
 
 
 def all_patches(survey: Array, finest_m: float) -> Array:
@@ -393,7 +393,7 @@ def _seek(
     pieces: Array,
     cuts: Array,
     seen: tuple[float, float],
-    least: tuple[int, int],
+    minimum: tuple[int, int],
     finest_m: float,
 ) -> Array:
     """Patches of `unseen` in strips; what pictures see across and along; lines and pictures."""
@@ -403,7 +403,7 @@ def _seek(
     patches: Array = _patches(
         *rooms(survey, levels, 0.0), levels, widths,
         np.searchsorted(pieces[:, 0], rows)[near], pieces,
-        np.searchsorted(cuts[:, 0], rows)[near], cuts, seen[1], *least, finest_m,
+        np.searchsorted(cuts[:, 0], rows)[near], cuts, seen[1], *minimum, finest_m,
     )  # fmt: skip
     return patches
 

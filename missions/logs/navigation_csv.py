@@ -177,7 +177,7 @@ def keys_of(image: str) -> list[str]:
     return ["/".join(parts[i:]) for i in range(len(parts))]
 
 
-def _usual_columns(path: Path, header: Sequence[str]) -> dict[str, str]:
+def _usual_columns(path: Path, header: Sequence[str], *, by_picture: bool) -> dict[str, str]:
     """Names in a header by the names that they have here; a warning names what is not read.
 
     Own names come first; then a column is that of the first usual name which it has.
@@ -193,6 +193,10 @@ def _usual_columns(path: Path, header: Sequence[str]) -> dict[str, str]:
         found.pop(HEIGHT, None)
     elif found.get("altitude_m", "altitude_m") != "altitude_m":
         del found["altitude_m"]  # above the floor, or above the sea?
+    if not by_picture:
+        found.pop(IMAGE, None)
+    if "time_s" in found:
+        found.pop("time_utc", None)
     lost = [one for one in header if one and one not in found.values()]
     if lost:
         names = [name for name in (*own, *_USUAL) if name not in found]
@@ -238,8 +242,8 @@ def read_navigation(
     header, rows = stream_csv(path)
     if is_growing:
         rows = (row for row, _ in itertools.pairwise(rows))
-    at = _usual_columns(path, header)
-    named = by_picture and IMAGE in at
+    at = _usual_columns(path, header, by_picture=by_picture)
+    named = IMAGE in at
     clocks = [name for name in ("time_s", "time_utc") if name in at]
     lacks = [name for name in needed if name not in at]
     if not clocks and not named:

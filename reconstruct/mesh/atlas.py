@@ -146,7 +146,8 @@ def pack(boxes: NDArray[np.int64], side: int) -> NDArray[np.int64]:
 def _fill_page(boxes: NDArray[np.int64], side: int) -> NDArray[np.int64]:
     """Corners (C, 2) of boxes (C, 2), taken in their order; -1 of those that do not fit."""
     corner = np.full(boxes.shape, -1, np.int64)
-    skyline, steps = np.zeros((min(side, 2 * len(boxes)) + 3, 2), np.int64), int(np.int64(1))
+    skyline = np.zeros((min(side, 2 * len(boxes)) + 3, 2), np.int64)
+    steps = int(np.int64(1))  # a literal has a type of its own
     for box in range(len(boxes)):
         width, height = boxes[box, 0], boxes[box, 1]
         x, y = _lowest(skyline[:steps], width, side)

@@ -86,7 +86,7 @@ class PictureFolder:
     pictures: tuple[Path, ...]
     """Pictures in the order of the numbers in their names."""
     masks: tuple[Path, ...]
-    """`NAME_mask.*` or `NAME.*.png` next to the picture `NAME.*`."""
+    """Those of `mask_names`, next to their pictures."""
     left_out: Mapping[str, tuple[Path, ...]]
     """What is not a picture that can be read, by reason."""
 
@@ -117,8 +117,9 @@ def look_into(
     except OSError as error:
         raise ImageError(f"{folder}: cannot be read: {error.strerror}") from None
     inside.sort(key=lambda p: [(natural_key(part), part) for part in p.relative_to(folder).parts])
-    listed = {str(path).lower() for path in inside if kind_of(path)}
-    stems = listed | {str(path.with_suffix("")).lower() for path in inside if kind_of(path)}
+    of_masks = {
+        (path.parent, name) for path in inside if kind_of(path) for name in mask_names(path.name)
+    }
     pictures: list[Path] = []
     masks: list[Path] = []
     left_out: dict[str, list[Path]] = {reason: [] for reason in ADVICE}
@@ -130,8 +131,7 @@ def look_into(
             reason = "HEIC" if suffix in HEIC else "video" if suffix in VIDEO else "other files"
             left_out[reason].append(path)
         else:
-            own = path.stem.removesuffix("_mask")
-            is_mask = str(path.with_name(own)).lower() in (listed if own == path.stem else stems)
+            is_mask = (path.parent, path.name.lower()) in of_masks
             (masks if is_mask else pictures).append(path)
     if not pictures:
         held = [f"{len(paths)} {reason}; {ADVICE[reason]}" for reason, paths in left_out.items()
@@ -146,6 +146,17 @@ def look_into(
         masks=tuple(masks),
         left_out={reason: tuple(paths) for reason, paths in left_out.items() if paths},
     )
+
+
+def mask_names(picture: str) -> list[str]:
+    """Names, in lower case, that the mask next to a picture may have.
+
+    Of `P1.JPG` they are `P1.JPG.png`, as COLMAP has it, and `P1_mask` of any kind, as OpenDroneMap
+    has it.
+    """
+    name, stem = picture.lower(), Path(picture).stem.lower()
+    ends = (end for kind in KINDS.values() for end in kind)
+    return [f"{name}.png", f"{name}_mask.png", *(f"{stem}_mask{end}" for end in ends)]
 
 
 def kind_of(path: Path) -> str:

@@ -45,6 +45,7 @@ from reconstruct.pictures.files import (
     inspect,
     kind_of,
     list_names,
+    mask_names,
     safe_name,
     target_suffix,
     to_utc,
@@ -599,34 +600,32 @@ def _bits(entries: Sequence[Incoming]) -> dict[str, int]:
 def with_masks(entries: Sequence[Incoming], masks: Path | None, *, stereo: bool) -> list[Incoming]:
     """Pictures with the masks in a folder of masks, or next to them; others are named.
 
-    A mask of `P1.JPG` is `P1.png`, `P1.JPG.png`, as COLMAP has it, or `P1_mask` of any kind, as
-    OpenDroneMap has it, in either case; next to the picture one of the last two.
+    In a folder of masks that of `P1.JPG` may also be `P1` of any kind.
     """
     files: dict[Path, dict[str, Path]] = {}
     found: list[Incoming] = []
     for entry in entries:
-        name, stem = entry.source.name.lower(), entry.source.stem.lower()
-        ends = [end for kind in KINDS.values() for end in kind]
-        names = [f"{name}.png", f"{name}_mask.png", *(f"{stem}_mask{end}" for end in ends)]
-        folders = [entry.source.parent]
+        names, folders = mask_names(entry.source.name), [entry.source.parent]
         if masks is not None:
-            names = [f"{stem}.png", *names, *(f"{stem}{end}" for end in ends)]
+            ends = (end for kind in KINDS.values() for end in kind)
+            names += [f"{entry.source.stem.lower()}{end}" for end in ends]
             folders = [masks / entry.camera, *([] if stereo else [masks])]
         for folder in set(folders) - set(files):
             inside = sorted(folder.iterdir()) if folder.is_dir() else []
             files[folder] = {path.name.lower(): path for path in inside}
-        there = (files[folder].get(one) for folder in folders for one in names)
-        mask = next((one for one in there if one is not None), None)
+        named = (files[folder].get(one) for folder in folders for one in names)
+        mask = next((one for one in named if one is not None), None)
         if mask is not None:
             read_mask(mask, (entry.facts.width_px, entry.facts.height_px))
         found.append(replace(entry, mask=mask))
     if masks is not None:
-        used = {entry.mask for entry in found}
-        lost = [p for own in files.values() for p in own.values() if kind_of(p) and p not in used]
-        if lost or used == {None}:
-            count = sum(len(own) for own in files.values())
-            warn(f"{len(used - {None})} of {count} masks belong to a picture, not "
-                 f"{list_names([p.name for p in lost], 3)}: name them as the pictures")  # fmt: skip
+        used = {entry.mask for entry in found} - {None}
+        there = [path for own in files.values() for path in own.values() if kind_of(path)]
+        lost = [path.name for path in there if path not in used]
+        if lost or not used:
+            such = f" (not {list_names(lost, 3)})" if lost else ""
+            warn(f"{masks}: {len(used)} of {len(there)} masks belong to a picture{such}: give them "
+                 "the names of their pictures")  # fmt: skip
     return found
 
 
@@ -693,7 +692,10 @@ def place_records(
     named = None
     if log is not None and log.row_of:
         logged_s, named = log.of_pictures([str(entry.source) for entry in entries])
-        times, origin = (logged_s, "") if np.isfinite(logged_s).any() else (times, origin)
+        if np.isfinite(logged_s).any():
+            times, origin = logged_s, ""
+            if clock_offset_s:
+                warn("--clock-offset is not used: the navigation log has the times of pictures")
     records = [replace(r, time_s=float(t)) for r, t in zip(records, times, strict=True)]
     if log is None:
         records, level = _with_gps(records, entries), "EXIF GPS altitude"

@@ -507,11 +507,8 @@ def _compare_places(
         far, extent_m = metres(at), float(metres(seen).max())
         far_off = far > _FAR_M + _FAR_SHARE * extent_m
         if far_off.any():
-            close = metres(at[:, ::-1]) < _FAR_M + _FAR_SHARE * extent_m
-            cause = (
-                "latitude and longitude seem exchanged" if (far_off & close).any()
-                else "check their coordinate system and its zone"
-            )  # fmt: skip
+            swapped = far_off & (metres(at[:, ::-1]) < _FAR_M + _FAR_SHARE * extent_m)
+            cause = "coordinates exchanged?" if swapped.any() else "check their system and its zone"
             warn(
                 f"{path}: {far_off.sum()} points lie {np.median(far[far_off]) / 1e3:,.1f} km from "
                 f"the pictures ({middle[0]:.5f}, {middle[1]:.5f}): {cause}"
@@ -525,15 +522,11 @@ def _compare_places(
     sigma = float(np.nanmax(sigmas)) if np.isfinite(sigmas).any() else 0.0
     off = abs(depth - picture) > _DEEP_M + _SIGMAS * sigma
     flipped = abs(depth + picture) < abs(depth - picture) / 2
-    if (off or (depth < -_ABOVE_M < _ABOVE_M < picture)) and flipped:
+    if off or (flipped and depth < -_ABOVE_M < _ABOVE_M < picture):
+        cause = "give depths as negative heights" if flipped else "what do heights count from?"
         warn(
-            f"{path}: points are {depth:.1f} m deep and pictures {picture:.1f} m: heights are "
-            "positive up, depths are to be given as negative heights"
-        )
-    elif off:
-        warn(
-            f"{path}: points are {depth:.1f} m deep and pictures {picture:.1f} m (sigma "
-            f"{sigma:.1f} m): check what the heights count from (--heights)"
+            f"{path}: points are {depth:.1f} m deep, pictures {picture:.1f} m (sigma {sigma:.1f} "
+            f"m): {cause} (--heights)"
         )
 
 

@@ -74,7 +74,7 @@ def varying_current(
     decay = math.exp(-step_s / correlation_s)
     process = rng.standard_normal((len(time_s), 2))
     process[1:] *= math.sqrt(1 - decay**2)
-    for before, now in itertools.pairwise(process):
+    for before, now in itertools.pairwise(process):  # a few hundred; scipy.signal loads for longer
         now += decay * before
     velocity = mean.velocity_ne_mps + sigma_mps * process[:, None, :]
     return check_current(Current(time_s, mean.depth_m, np.array(velocity, dtype=np.float64)))

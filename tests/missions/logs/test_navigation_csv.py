@@ -178,7 +178,7 @@ def test_columns_that_are_not_read_are_named(
     warned = capsys.readouterr().err
     assert all(name in warned for name in (*header.split(",")[1:5], "depth_m", "latitude_deg"))
     assert "roll" not in warned and warned.count("\n") == 1
-    with refused(NavigationError, "twice"):
+    with refused(NavigationError, "occurs twice"):
         read_navigation(log_file(tmp_path, "0,60,5", header="time_s,depth_m,depth_m"), UTC, ())
 
 

@@ -332,8 +332,8 @@ def test_control_rows_are_replaced_by_kind_and_name(tmp_path: Path) -> None:
         ("-71.00001 46.00001 -6.0", (20, 30), ""),
         ("46 -71 -6.0", (20, 30), "exchanged"),
         ("-70 46 -6.0", (20, 30), "zone"),
-        ("-71 46 5.5", (20, 30), "positive up"),
-        ("-71 46 -260", (20, 30), "--heights"),
+        ("-71 46 5.5", (20, 30), "negative heights"),
+        ("-71 46 -260", (20, 30), "count from"),
         ("-71 46 -6.0", (410, 230), "6.4"),
     ],
 )  # fmt: skip
