@@ -241,8 +241,8 @@ def check_raster(path: Path) -> None:
         )
 
 
-_SHALLOW = 0.5
-_SOME = 0.01
+_SHALLOW_M, _SOME = 0.5, 0.01
+"""Least distance of values from zero, and share of zeros, for which zero stands for unknown."""
 
 
 def _without_unknown(path: Path, band: Any) -> Any:
@@ -251,7 +251,7 @@ def _without_unknown(path: Path, band: Any) -> Any:
     Zero is one where it is in a hundredth of the cells and the others are far from it.
     """
     zero = band == 0
-    far = np.ma.abs(band[~zero]) > _SHALLOW
+    far = np.ma.abs(band[~zero]) > _SHALLOW_M
     unknown = [value for value in UNKNOWN if (band == value).any()]
     unknown += [0.0] * bool(zero.mean() > _SOME and far.size and far.all())
     if unknown:

@@ -131,8 +131,7 @@ def look_into(
             reason = "HEIC" if suffix in HEIC else "video" if suffix in VIDEO else "other files"
             left_out[reason].append(path)
         else:
-            is_mask = (path.parent, path.name.lower()) in of_masks
-            (masks if is_mask else pictures).append(path)
+            (masks if (path.parent, path.name.lower()) in of_masks else pictures).append(path)
     if not pictures:
         held = [f"{len(paths)} {reason}; {ADVICE[reason]}" for reason, paths in left_out.items()
                 if paths]  # fmt: skip
