@@ -4,7 +4,7 @@
 
 PYTHON may be one with an installed wheel. The tutorial's survey is made with no kernel kept, then
 made again; each command runs in a process of its own with one thread. CPU seconds are those of user
-and system; seconds of compiling are numba's, those of numba's own functions included, which are not counted as kernels.
+and system. Seconds of compiling include those of numba's own functions, which are not counted.
 """
 
 import argparse
