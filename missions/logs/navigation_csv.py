@@ -185,10 +185,11 @@ def _usual_columns(path: Path, header: Sequence[str], *, by_picture: bool) -> di
     own = (*COLUMNS, "time_s", "time_utc", IMAGE)
     found = {name: name for name in own if name in header}
     bare = {name: _bare(name) for name in header}
+    others = {bare[name]: name for name in reversed(bare) if name not in found}
     for name, usual in _USUAL.items():
-        for one in header:
-            if name not in found and one not in found.values() and bare[one] in usual.split():
-                found[name] = one
+        for one in usual.split():
+            if name not in found and one in others:
+                found[name] = others.pop(one)
     if "depth_m" in found:
         found.pop(HEIGHT, None)
     elif found.get("altitude_m", "altitude_m") != "altitude_m":
@@ -197,10 +198,10 @@ def _usual_columns(path: Path, header: Sequence[str], *, by_picture: bool) -> di
         found.pop(IMAGE, None)
     if "time_s" in found:
         found.pop("time_utc", None)
-    lost = [one for one in header if one and one not in found.values()]
+    lost = [one for one in bare if one and one not in found.values()]
     if lost:
         names = [name for name in (*own, *_USUAL) if name not in found]
-        near = (difflib.get_close_matches(bare[one], names, 1) for one in lost)
+        near = (difflib.get_close_matches(bare[one], names, 1) for one in lost[:100])
         meant = dict.fromkeys(name for some in near for name in some)
         if {"east", "north", "easting", "northing"} & set(bare.values()):
             meant |= dict.fromkeys(("latitude_deg", "longitude_deg"))
