@@ -51,9 +51,25 @@ def _fly_summary(folder: Path) -> Summary:
     return text, flight.to_json()
 
 
+_MAX_MISSED_SHARE = 0.05
+"""Of the planned pictures, missed or off their lines: neighbouring lines overlap by more."""
+
+
 def _fly_shortfall(folder: Path) -> str:
-    ending = FlightRecord.read(folder / "flight.json").ending
-    return "" if ending == "complete" else f"the flight ended early: {ending}"
+    flight = FlightRecord.read(folder / "flight.json")
+    if flight.ending != "complete":
+        return f"the flight ended early: {flight.ending}"
+    worst_m, allowed_m = flight.outside_allowed.worst_m, flight.allowed_cross_track_m
+    if worst_m > allowed_m:
+        return f"{flight.vehicle} left the allowed area by {worst_m:.2f} m"
+    planned = flight.stations_planned
+    missed = max(planned - flight.stations, 0) + flight.stations_off_line
+    if missed > _MAX_MISSED_SHARE * planned:
+        return (
+            f"{missed} of {planned} pictures were missed or taken more than {allowed_m:.2f} m off "
+            "their lines"
+        )
+    return ""
 
 
 def _metres(value: float | None) -> str:
@@ -121,7 +137,7 @@ FLY = StageSpec(
     folder="flight",
     command="fly",
     about="the plan flown by a simulated vehicle",
-    version=6,
+    version=7,
     work="missions.fly.run:run_fly",
     takes=(
         "seed",

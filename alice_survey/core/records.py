@@ -77,6 +77,13 @@ class MissionFlown(JsonRecord):
     """What the plan's certificate promises of its lines."""
 
 
+class OutsideAllowed(JsonRecord):
+    """How a flight kept within the allowed area."""
+
+    share_of_time: float
+    worst_m: float
+
+
 class FlightRecord(JsonRecord):
     """`flight/flight.json`."""
 
@@ -88,6 +95,9 @@ class FlightRecord(JsonRecord):
     duration_s: float
     stations: int
     stations_planned: int
+    stations_off_line: int
+    allowed_cross_track_m: float
+    outside_allowed: OutsideAllowed
     on_lines: OnLines
     in_turns: InTurns
     navigation_error_rms_m: float | None

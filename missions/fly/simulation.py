@@ -85,7 +85,12 @@ from missions.coverage.stations import Stations, plan_pattern, stations_of_lines
 from missions.exports.follower import cola2_delta_m, cola2_settings, sways
 from missions.exports.geometry import CameraMount
 from missions.exports.registry import read_mission
-from missions.route.energy import sound_vehicle
+from missions.route.energy import (
+    flies_everywhere,
+    flight_conditions,
+    plan_as_flown,
+    sound_vehicle,
+)
 from missions.values.flight import Flight, trigger_times
 from missions.values.legs import Leg, Route
 from missions.values.line import Line
@@ -240,7 +245,7 @@ def piloting_of(
     reference = (0.0, 0.0, 0.0)
     followed_body_m = settings.camera.position_body_m if mission.law == NO_LAW else reference
 
-    def pilot_without(left: Mapping[str, float]) -> tuple[Gains, Guidance]:
+    def pilot_with(left: Mapping[str, float]) -> tuple[Gains, Guidance]:
         gains = gains_for(vehicle.weaken(left), plan.speed_mps)
         guidance = pilot_guidance(
             gains,
@@ -271,9 +276,22 @@ def piloting_of(
             )
         return gains, guidance._replace(under_way=guidance.under_way._replace(side=side))
 
+    depth_m = plan.seafloor_depth_m - plan.altitude_m
+    requested = plan_as_flown(settings.plan, vehicle), settings.vehicle, settings.sea, depth_m
+    expected = flight_conditions(*requested, settings.camera.position_body_m)
+
+    def pilot_without(
+        left: Mapping[str, float], current_ne_mps: Array | None
+    ) -> tuple[Gains, Guidance]:
+        known_ne = expected.current_ne_mps if current_ne_mps is None else current_ne_mps
+        weak = vehicle.weaken(left)
+        if not flies_everywhere(replace(expected, vehicle=weak, current_ne_mps=known_ne)):
+            raise VehicleError(f"{vehicle.name} cannot fly the plan with the thrust it has left")
+        return pilot_with(left)
+
     # The pilot flies as well as the thrusters allow that he knows to be sound.
     known = settings.vehicle.impaired
-    gains, guidance = pilot_without(known)
+    gains, guidance = pilot_with(known)
     return Piloting(
         vehicle=vehicle,
         path=path,

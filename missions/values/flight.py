@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import shapely
 
 from alice_survey.core.frames import Array, attitude_from_rotation
 from alice_survey.core.trajectory import Trajectory
@@ -95,6 +96,17 @@ class Flight:
             for place, index in zip(places, self.trigger_line, strict=True)
         ]
         return int(np.sum(np.abs(off) > self.plan.allowed_offset_m))
+
+    @cached_property
+    def outside_m(self) -> Array:
+        """(T,) metres: how far the left port truly was outside of the allowed area, or in a zone."""
+        places = shapely.points(self.glass_ned[:, :2])
+        allowed = self.plan.area.allowed
+        shapely.prepare(allowed)
+        outside = np.zeros(len(places))
+        away = ~shapely.intersects(allowed, places)
+        outside[away] = shapely.distance(allowed, places[away])
+        return outside
 
     def _cross_track(self, glass_ned: Array) -> Array:
         cross = np.full(len(self.line), np.nan)

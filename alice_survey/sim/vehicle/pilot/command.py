@@ -283,8 +283,9 @@ def _lasting(variance: Array, lagged: Array) -> Array:
     return longer
 
 
-Without = Callable[[Mapping[str, float]], tuple[Gains, Guidance]]
-"""How to fly with what thrusters have left; a `VehicleError`: not at all."""
+Without = Callable[[Mapping[str, float], Array | None], tuple[Gains, Guidance]]
+"""How to fly with what thrusters have left in a current, (2,) m/s north and east, if it is known; a
+`VehicleError`: not at all."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -370,8 +371,10 @@ class Pilot:
             self.known[failure.thruster] = min(failure.left, self.known.get(failure.thruster, 1.0))
         if found:
             self.allocation.health[:] = self._flies.vehicle.health_of(self.known)
+            water_ne = None if navigated is None else navigated.water_ne
             try:
-                before, (self.gains, self.guidance) = self.gains, self._flies.without(self.known)
+                before, after = self.gains, self._flies.without(self.known, water_ne)
+                self.gains, self.guidance = after
                 _carry_over(self.state, before, self.gains)
             except VehicleError:
                 report = self.state.report
