@@ -207,7 +207,12 @@ def _simulate(
 
 def max_mission_s(plan: Plan) -> float:
     """After how long a mission is aborted."""
-    return _PATIENCE * (plan.duration_s + 2.0 * plan.seafloor_depth_m / _CLIMB_MPS)
+    return _PATIENCE * plan.duration_s + 2.0 * max_ascent_s(plan)
+
+
+def max_ascent_s(plan: Plan) -> float:
+    """After how long a vehicle that pushes itself up is at the surface, whatever hinders it."""
+    return _PATIENCE * plan.seafloor_depth_m / _CLIMB_MPS
 
 
 def piloting_of(

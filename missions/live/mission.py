@@ -8,13 +8,17 @@ What is flown by is never old, wrong or of another clock:
 
 - odometry that is not finite, older than `LinkLimits.odometry_s` when it arrives, from the future
   or not newer than what came before is refused;
+- so is odometry that is fresh but wrong (`OdometryCheck`): a pose that stands still to the last bit
+  while the vehicle is flown, one that jumps, a speed that the vehicle cannot reach, and a velocity
+  that is not that of the positions;
 - ticks that are farther apart than `LinkLimits.jump_s`, or go back, are a jump of the clock: all
   that was heard before is forgotten;
 - an altitude older than `LinkLimits.altitude_s` is not known, which the pilot itself handles.
 
 Without odometry to fly by the thrust is zero (HELD) until it is back, at most `LinkLimits.grace_s`.
 After that the mission is given up for good (GIVEN_UP): the vehicle pushes itself up, or its
-thrusters stay off, as `LinkLimits.on_loss` has it, until odometry says that it is at the surface.
+thrusters stay off, as `LinkLimits.on_loss` has it, until odometry says that it is at the surface,
+at most for `PilotLoop.surfacing_s`.
 """
 
 import math
@@ -29,17 +33,27 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from alice_survey.core.artefacts import read_stage, refuse_damage, write_csv
-from alice_survey.core.errors import VehicleError, WorkspaceError
+from alice_survey.core.config import VehicleConfig
+from alice_survey.core.errors import VehicleError, WorkspaceError, note
 from alice_survey.core.frames import Array, attitude_from_rotation, rotation_from_attitude
 from alice_survey.sim.vehicle import estimate_vector as vector
 from alice_survey.sim.vehicle.navigation.sensors import DvlSpec
 from alice_survey.sim.vehicle.pilot import memory as slot
 from alice_survey.sim.vehicle.pilot.command import WATCHED_S, Failure, Pilot
 from alice_survey.sim.vehicle.pilot.memory import NONE, REASONS
+from alice_survey.sim.vehicle.propulsion import MAX_RPS, electrical_power
 from alice_survey.sim.vehicle.rotations import wrap_angle
 from alice_survey.sim.vehicle.simulator import TICK_S
+from alice_survey.sim.vehicle.steady import top_speed_mps
 from alice_survey.sim.vehicle.vehicle import Vehicle
-from missions.fly.simulation import FlightSettings, max_mission_s, one_dive, piloting_of
+from missions.fly.simulation import (
+    FlightSettings,
+    max_ascent_s,
+    max_mission_s,
+    one_dive,
+    piloting_of,
+)
+from missions.route.energy import battery_wh, usable_wh
 from missions.values.plan_file import Plan, read_plan
 
 FIRST_S, SILENCE_S = 600.0, 60.0
@@ -113,6 +127,8 @@ class Odometry:
     """(3,) of the origin over ground, m/s."""
     rates_body: Array
     """(3,) rad/s."""
+    sigma_m: float = 0.0
+    """Standard deviation of the position towards north or east; 0 where it is not stated."""
 
     @property
     def is_finite(self) -> bool:
@@ -143,6 +159,91 @@ class Command:
     """Wanted; NaN where there is none."""
 
 
+_FASTER = 2.0
+"""Over the speed that a vehicle reaches in still water: no current carries it faster (inferred)."""
+_SIGMAS = 5.0
+_STEP_M = 1.0
+"""A position may be corrected by so many of its sigmas, or by so much where it states none
+(inferred: fixes of a USBL)."""
+_FIT_S, _FIT_MPS = 5.0, 0.1
+"""Over so long the velocity's integral must be the way of the positions, to so much (inferred)."""
+
+
+class OdometryCheck:
+    """Finds odometry that is fresh but wrong."""
+
+    def __init__(self, max_speed_mps: float) -> None:
+        """A check that has seen nothing.
+
+        Args:
+            max_speed_mps: over ground, that the vehicle cannot reach.
+        """
+        self._max_speed_mps = max_speed_mps
+        self.forget()
+
+    def forget(self) -> None:
+        """Compare with nothing that was heard until now."""
+        self._kept: Odometry | None = None
+        self._before: Odometry | None = None
+        self._silence_s = 0.0
+        self._from_s, self._from_ned, self._way_ned = -math.inf, np.zeros(3), np.zeros(3)
+        self._fits = True
+
+    def fault(self, odometry: Odometry, *, is_flown: bool) -> str:
+        """What is wrong with new odometry, in words; empty if nothing is.
+
+        Args:
+            odometry: finite, and newer than any before.
+            is_flown: whether the vehicle is flown by it, and so cannot lie still.
+        """
+        before, self._before = self._before, odometry
+        if before is None or not is_flown:
+            self._from_s = -math.inf
+        if before is not None:
+            self._follow(before, odometry)
+        if np.linalg.norm(odometry.velocity_body) > self._max_speed_mps:
+            return "odometry is faster than the vehicle can be"
+        kept = self._kept
+        if is_flown and kept is not None and before is not None:
+            if _same_pose(before, odometry):
+                return "odometry does not change while the vehicle is flown"
+            # While positions are refused the vehicle is not taken to come nearer to them.
+            if before is kept:
+                self._silence_s = odometry.stamp_s - kept.stamp_s
+            reach_m = self._max_speed_mps * self._silence_s + _correction_m(odometry, kept)
+            if np.linalg.norm(odometry.position_ned - kept.position_ned) > reach_m:
+                return "odometry jumps"
+        if not self._fits:
+            return "odometry's velocity is not that of its positions"
+        self._kept = odometry
+        return ""
+
+    def _follow(self, before: Odometry, now: Odometry) -> None:
+        """Compare the positions' way with the integral of the velocity, stretch by stretch."""
+        step_s = now.stamp_s - before.stamp_s
+        turn = Rotation.from_quat(now.quaternion_xyzw)
+        self._way_ned += step_s * turn.apply(now.velocity_body)
+        taken_s = now.stamp_s - self._from_s
+        if taken_s < _FIT_S:
+            return
+        if math.isfinite(taken_s):
+            off_m = np.linalg.norm(now.position_ned - self._from_ned - self._way_ned)
+            self._fits = bool(off_m <= _FIT_MPS * taken_s + _correction_m(now, before))
+        self._from_s, self._from_ned, self._way_ned = now.stamp_s, now.position_ned, np.zeros(3)
+
+
+def _same_pose(one: Odometry, other: Odometry) -> bool:
+    return np.array_equal(one.position_ned, other.position_ned) and np.array_equal(
+        one.quaternion_xyzw, other.quaternion_xyzw
+    )
+
+
+def _correction_m(*odometry: Odometry) -> float:
+    """By how much a position may be corrected between some odometry."""
+    sigma_m = max(one.sigma_m for one in odometry)
+    return _SIGMAS * sigma_m if sigma_m > 0.0 else _STEP_M
+
+
 class PilotLoop:
     """A pilot, and what it has heard so far."""
 
@@ -153,6 +254,8 @@ class PilotLoop:
         hull_body_m: Array,
         altimeter_body_m: tuple[float, float, float],
         limits: LinkLimits,
+        max_speed_mps: float,
+        surfacing_s: float,
     ) -> None:
         """A loop at the start of a mission.
 
@@ -161,9 +264,11 @@ class PilotLoop:
             hull_body_m: (P, 3) points whose clearance is minded.
             altimeter_body_m: place of the altimeter, which looks along the body's down.
             limits: for what is heard.
+            max_speed_mps: over ground, that the vehicle cannot reach.
+            surfacing_s: for how long it pushes up once the mission is given up.
         """
-        self.pilot, self.limits = pilot, limits
-        pilot.state.memory[slot.SIGMA_M] = math.inf  # odometry is not asked for its sigma
+        self.pilot, self.limits, self.surfacing_s = pilot, limits, surfacing_s
+        self._check = OdometryCheck(max_speed_mps)
         self.state, self.failures = LinkState.WAITING, list[Failure]()
         self.refused: Counter[str] = Counter()
         """How many messages were refused, by reason."""
@@ -178,7 +283,7 @@ class PilotLoop:
         self._floor: tuple[float, float, float] | None = None
         self._rps: tuple[float, Array] | None = None
         self._stretch: list[tuple[Array, Array]] = []
-        self._heading_rad, self._flown_s, self._held_s = 0.0, 0.0, 0.0
+        self._heading_rad, self._flown_s, self._held_s, self._given_up_s = 0.0, 0.0, 0.0, 0.0
         self._last: Command | None = None
         self._why = "no odometry came yet"
 
@@ -186,15 +291,20 @@ class PilotLoop:
         """Take odometry, unless it is to be refused."""
         before = self._odometry
         if not odometry.is_finite:
-            self._refuse("odometry is not a number")
+            self.refuse("odometry is not a number")
         elif now_s - odometry.stamp_s > self.limits.odometry_s:
-            self._refuse("odometry comes too late")
+            self.refuse("odometry comes too late")
         elif odometry.stamp_s - now_s > self.limits.ahead_s:
-            self._refuse("odometry is from the future")
+            self.refuse("odometry is from the future")
         elif before is not None and odometry.stamp_s <= before.stamp_s:
-            self._refuse("odometry is not newer than before")
+            self.refuse("odometry is not newer than before")
         else:
-            self._odometry = odometry
+            is_flown = self.state in (LinkState.FLYING, LinkState.HELD)
+            fault = self._check.fault(odometry, is_flown=is_flown)
+            if fault:
+                self.refuse(fault)
+            else:
+                self._odometry = odometry
 
     def hear_range(self, stamp_s: float, range_m: float, now_s: float) -> None:
         """Take the range of the altimeter, metres; one that is not finite is no echo."""
@@ -202,14 +312,14 @@ class PilotLoop:
         if not math.isfinite(range_m):
             return
         if not -self.limits.ahead_s <= now_s - stamp_s <= self.limits.altitude_s:
-            self._refuse("altitude is not of now")
+            self.refuse("altitude is not of now")
             return
         if odometry is None:
             return
         turn = Rotation.from_quat(odometry.quaternion_xyzw)
         down = float(turn.apply([0.0, 0.0, 1.0])[2])
         if range_m <= 0.0 or down < math.cos(_MAX_TILT_RAD):
-            self._refuse("altitude is not of the bottom")
+            self.refuse("altitude is not of the bottom")
             return
         depth = odometry.position_ned[2] + turn.apply(self._altimeter_body)[2] + range_m * down
         sigma = math.hypot(DvlSpec().range_noise_m, DvlSpec().range_noise_fraction * range_m)
@@ -231,6 +341,7 @@ class PilotLoop:
         if jumped:
             self.jumps += 1
             self._odometry = self._floor = self._rps = None
+            self._check.forget()
             self._why = f"the clock jumped by {moved:.2f} s"
         elif moved > _LATE * TICK_S:
             self.late_ticks += 1
@@ -256,6 +367,10 @@ class PilotLoop:
             self.estimate = np.full(vector.ESTIMATE, np.nan)
             if odometry is not None and odometry.position_ned[2] < self.pilot.guidance.surface_m:
                 self.end(f"given up: {self._why}")
+                return False
+            self._given_up_s += step_s
+            if self._given_up_s > self.surfacing_s:
+                self.end(f"given up: {self._why}; not known to be at the surface")
                 return False
             if self.limits.on_loss == "drift":
                 return False
@@ -291,8 +406,11 @@ class PilotLoop:
             heading_rad=float(pilot.state.report[slot.TARGET_HEADING]) if sees else math.nan,
         )
 
-    def _refuse(self, why: str) -> None:
+    def refuse(self, why: str) -> None:
+        """Count a message that is not flown by; the first of a kind is reported."""
         self.refused[why] += 1
+        if self.refused[why] == 1:
+            note(f"not flown by: {why}")
         if self.state in (LinkState.WAITING, LinkState.HELD):
             self._why = why
 
@@ -322,6 +440,7 @@ class PilotLoop:
         estimate[vector.U : vector.P] = odometry.velocity_body
         estimate[vector.P : vector.ALTITUDE] = odometry.rates_body
         estimate[vector.ALTITUDE] = estimate[vector.CLEARANCE] = math.nan
+        self.pilot.state.memory[slot.SIGMA_M] = odometry.sigma_m or math.inf
         if self._floor is None or now_s - self._floor[0] > self.limits.altitude_s:
             return
         _, floor_m, sigma_m = self._floor
@@ -438,6 +557,19 @@ class LiveMission:
         )  # fmt: skip
 
 
+def _surfacing_s(plan: Plan, settings: VehicleConfig, vehicle: Vehicle) -> float:
+    """For how long a vehicle that is lost may push itself up.
+
+    Three climbs at the slowest rate, and no longer than the reserve of its battery lasts at full
+    power.
+    """
+    propulsion, count = vehicle.plant.propulsion, len(vehicle.thrusters)
+    full_w = np.zeros(count)
+    electrical_power(propulsion, propulsion.table[:, MAX_RPS].copy(), np.zeros(6), full_w)
+    reserve_j = 3600.0 * (battery_wh(settings) - usable_wh(settings))
+    return min(max_ascent_s(plan), reserve_j / float(full_w.sum()))
+
+
 def mission_of(
     plan: Plan,
     settings: FlightSettings,
@@ -462,6 +594,8 @@ def mission_of(
         hull_body_m=flies.vehicle.hull.points_body_m,
         altimeter_body_m=altimeter_body_m or settings.camera.dvl_position_body_m,
         limits=limits,
+        max_speed_mps=_FASTER * top_speed_mps(flies.vehicle),
+        surfacing_s=_surfacing_s(plan, settings.vehicle, flies.vehicle),
     )
     thrusters = tuple(thruster.name for thruster in flies.vehicle.thrusters)
     return LiveMission(plan, loop, flies.vehicle.name, thrusters)

@@ -63,6 +63,7 @@ from missions.logs.ros_builder import (
     CLOCK,
     IMU,
     JOINTS,
+    MAP,
     NS_PER_S,
     ODOMETRY,
     RANGE,
@@ -162,7 +163,14 @@ def odometry_from(message: Any) -> Odometry:
         quaternion_xyzw=flipped_quaternion(np.array([turn.x, turn.y, turn.z, turn.w])),
         velocity_body=flipped_body(_xyz(twist.linear)),
         rates_body=flipped_body(_xyz(twist.angular)),
+        sigma_m=_sigma_m(message.pose.covariance),
     )
+
+
+def _sigma_m(covariance: Any) -> float:
+    """Standard deviation of the position towards north or east; 0 where it is not stated."""
+    variance = max(float(covariance[0]), float(covariance[7]))
+    return math.sqrt(variance) if variance > 0.0 and math.isfinite(variance) else 0.0
 
 
 def odometry_message(
@@ -227,6 +235,10 @@ class Topics:
     """Names of the topics, below the vehicle's where they do not begin with a slash."""
 
     odometry: str = "navigation/odometry"
+    frame: str = MAP
+    """Of the odometry's poses: east, north, up from the plan's datum."""
+    body_frame: str = "base_link"
+    """Of its velocities, without the vehicle's name: forward, left, up."""
     altitude: str = "altimeter"
     thrusters: str = "thrusters/state"
     wrench: str = "pilot/wrench"
@@ -280,7 +292,7 @@ class _PilotNode:
         self._clock_s = 0.0
         self.ticked = time.monotonic()
         """Wall time of the latest tick."""
-        self._sim_time = sim_time
+        self._sim_time, self._topics = sim_time, topics
         try:
             self.wrench = node.create_publisher(kind(WRENCH), topics.wrench, qos)
             self.command = node.create_publisher(kind(JOINTS), topics.command, qos)
@@ -316,8 +328,16 @@ class _PilotNode:
             self._publish(command)
 
     def _on_odometry(self, message: Any) -> None:
-        if self._has_begun:
+        if not self._has_begun:
+            return
+        frames = message.header.frame_id.lstrip("/"), message.child_frame_id.split("/")[-1]
+        if frames == (self._topics.frame, self._topics.body_frame):
             self.mission.loop.hear_odometry(odometry_from(message), self.now_s)
+        else:
+            self.mission.loop.refuse(
+                f"odometry is of {frames[1] or 'no frame'} in {frames[0] or 'no frame'}, not of "
+                f"{self._topics.body_frame} in {self._topics.frame}"
+            )
 
     def _on_range(self, message: Any) -> None:
         if self._has_begun:

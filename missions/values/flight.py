@@ -99,7 +99,7 @@ class Flight:
 
     @cached_property
     def outside_m(self) -> Array:
-        """(T,) metres: how far the left port truly was outside of the allowed area, or in a zone."""
+        """(T,) metres: how far the left port truly was out of the allowed area, or in a zone."""
         places = shapely.points(self.glass_ned[:, :2])
         allowed = self.plan.area.allowed
         shapely.prepare(allowed)

@@ -398,6 +398,11 @@ class PilotCommand(SurveyCommand):
         "navigation/odometry", "Topic of nav_msgs/Odometry from the plan's datum.",
         metavar="TOPIC",
     )  # fmt: skip
+    frame: str = option("map", "Frame of its poses: east, north, up.", metavar="FRAME")
+    body_frame: str = option(
+        "base_link", "Frame of its velocities: forward, left, up; without the vehicle's name.",
+        metavar="FRAME",
+    )  # fmt: skip
     altitude: str = option(
         "altimeter", "Topic of sensor_msgs/Range of the altimeter.", metavar="TOPIC"
     )
@@ -455,7 +460,10 @@ class PilotCommand(SurveyCommand):
         if self.mavlink is not None:
             pilot_over_mavlink(mission, self.mavlink, sim_time=self.sim_time)
         else:
-            topics = Topics(odometry=self.odometry, altitude=self.altitude)
+            topics = Topics(
+                odometry=self.odometry, altitude=self.altitude, frame=self.frame,
+                body_frame=self.body_frame,
+            )  # fmt: skip
             pilot_over_ros(mission, topics, sim_time=self.sim_time)
 
     def is_passed(self, data: Any) -> bool:

@@ -19,6 +19,8 @@ from alice_survey.sim.vehicle.sea import Current, current_at
 
 STATE = 13
 """Length of the state without thrusters and fins."""
+_DRAUGHT_M = 0.2
+"""A body whose origin is so far above the surface is out of the water (inferred)."""
 
 
 class Body(NamedTuple):
@@ -63,13 +65,15 @@ class Scratch(NamedTuple):
     """(5, N) stages of the Runge-Kutta step."""
     force: Array
     """(6,)"""
+    thrust: Array
+    """(6,)"""
     water: Array
     """(6,) current and its slopes."""
 
 
 def scratch_for(actuators: int) -> Scratch:
     """Work arrays for a vehicle with a number of thrusters and drives of fins."""
-    return Scratch(np.zeros((5, STATE + actuators)), np.zeros(6), np.zeros(6))
+    return Scratch(np.zeros((5, STATE + actuators)), np.zeros(6), np.zeros(6), np.zeros(6))
 
 
 def initial_state(
@@ -253,6 +257,17 @@ def derivative(
     add_damping(body, nu, force)
     add_coriolis(body, nu, force)
     add_weight(body, r20, r21, r22, force)
+    if state[2] < 0.0:
+        # Above the surface the hull loses its buoyancy, and propellers their water.
+        dry = min(-state[2] / _DRAUGHT_M, 1.0)
+        scratch.thrust[:] = 0.0
+        add_thrust(plant.propulsion, state[13:], nu, scratch.thrust)
+        for i in range(6):
+            force[i] -= dry * scratch.thrust[i]
+        lost_n = dry * body.buoyancy_n
+        force[0] += lost_n * r20
+        force[1] += lost_n * r21
+        force[2] += lost_n * r22
     # A current that changes along the way down, and in time.
     along_n, along_e = water[4] * out[2], water[5] * out[2]
     if along_n != 0.0 or along_e != 0.0 or water[2] != 0.0 or water[3] != 0.0:

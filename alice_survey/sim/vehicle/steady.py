@@ -260,6 +260,14 @@ def steady_flight(
     )
 
 
+def top_speed_mps(vehicle: Vehicle) -> float:
+    """Highest surge that thrusters keep in still water, level; 0 where there is none."""
+    nu = np.zeros((200, 6))
+    nu[:, 0] = np.geomspace(*_SPEEDS_MPS, len(nu))
+    kept = np.isfinite(steady_flight(vehicle, nu).power_w)
+    return float(nu[kept, 0].max(initial=0.0))
+
+
 def _fin_force_ahead(vehicle: Vehicle, nu: Array, share: float) -> Array:
     """Force ahead, (N, 6), that keeps a vehicle with fins at surges and rates of turn.
 

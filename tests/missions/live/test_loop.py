@@ -1,14 +1,19 @@
 """The pilot's loop against the closed loop, and its safe states."""
 
 import math
+from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import replace
+from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from alice_survey.core.config import SurveyConfig
-from missions.live.mission import LinkState
+from alice_survey.sim.vehicle.pilot.memory import SIGMA_M
+from missions.live.mission import LinkState, Odometry
 from missions.values.flight import trigger_times
 from tests.missions.flown_plans import flown
 from tests.missions.live.flights import FLOOR_M, LoopFlight, small_plan
@@ -40,15 +45,20 @@ def test_loop_flies_as_the_closed_loop_does() -> None:
     assert np.ptp(east[:6]) > 1e-4
 
 
-@pytest.fixture
-def following() -> LoopFlight:
-    """A vehicle that follows its first line."""
-    flight = LoopFlight()
+@cache
+def on_its_first_line(**limits: Any) -> LoopFlight:
+    flight = LoopFlight(**limits)
     flight.until("follow")
     flight.ticks(100)
     assert flight.command.state == LinkState.FLYING
     assert np.abs(flight.command.rps).max() > 1.0
     return flight
+
+
+@pytest.fixture
+def following() -> LoopFlight:
+    """A vehicle that follows its first line."""
+    return deepcopy(on_its_first_line())
 
 
 def is_off(flight: LoopFlight) -> bool:
@@ -119,6 +129,81 @@ def test_odometry_that_is_not_a_number_is_refused(
     assert following.loop.refused == {"odometry is not a number": 20}
 
 
+def moved(odometry: Odometry, east_m: float) -> Odometry:
+    return replace(odometry, position_ned=odometry.position_ned + east_m * np.eye(3)[1])
+
+
+_FAULTS: dict[str, tuple[float, Callable[[Odometry, Odometry], Odometry]]] = {
+    "frozen": (0.6, lambda now, first: replace(first, stamp_s=now.stamp_s)),
+    "jumped": (0.6, lambda now, first: moved(now, 30.0)),
+    "jumped a little": (0.6, lambda now, first: moved(now, 3.0)),
+    "too fast": (0.6, lambda now, first: replace(now, velocity_body=np.array([100.0, 0.0, 0.0]))),
+    "wrong velocity": (
+        12.0, lambda now, first: replace(now, velocity_body=now.velocity_body + 0.5 * np.eye(3)[0])
+    ),
+    "north for east": (
+        12.0, lambda now, first: replace(now, position_ned=now.position_ned[[1, 0, 2]])
+    ),
+    "100 s of a mission older": (0.6, lambda now, first: replace(now, stamp_s=now.stamp_s - 100)),
+}  # fmt: skip
+"""Odometry that is wrong from a moment on, and within how many seconds nothing is flown by it."""
+
+
+@pytest.mark.parametrize("fault", _FAULTS)
+def test_odometry_that_is_fresh_but_wrong_ends_the_mission(
+    following: LoopFlight, fault: str
+) -> None:
+    """Held, then given up, and an end in bounded time, at the surface of the simulated sea."""
+    within_s, spoil = _FAULTS[fault]
+    first = following.true_odometry()
+    begun = following.truth[:3].copy()
+    for _ in range(20 * 3600):
+        following.tick(odometry=spoil(following.true_odometry(), first))
+        if following.command.state != LinkState.FLYING:
+            break
+    assert following.command.state == LinkState.HELD
+    went_m = np.linalg.norm(following.truth[:3] - begun)
+    assert went_m < 0.1 + 0.5 * within_s
+    while following.loop.state != LinkState.OVER and following.vehicle.tick < 20 * 3600:
+        following.tick(odometry=spoil(following.true_odometry(), first))
+    assert following.loop.ending.startswith("given up: odometry")
+    assert is_off(following)
+    assert -0.2 < following.truth[2] < 0.3
+
+
+def test_good_odometry_is_flown_by_through_noise_and_fixes(following: LoopFlight) -> None:
+    """Errors as a filter has them: noise, a fix that moves it by 4 of its sigmas, a gap of 1 s."""
+    rng = np.random.default_rng(7)
+    for i in range(600):
+        now = following.true_odometry()
+        east_m = 2.0 * (i > 200) + 0.01 * rng.standard_normal()
+        noisy = replace(moved(now, east_m), sigma_m=0.5)
+        following.tick(odometry="none" if 400 < i < 420 else noisy)
+    assert not following.loop.refused
+    assert following.command.state == LinkState.FLYING
+
+
+def test_odometry_says_how_well_it_knows_its_place(following: LoopFlight) -> None:
+    for _ in range(2):
+        following.tick(odometry=replace(following.true_odometry(), sigma_m=0.07))
+    assert following.loop.pilot.state.memory[SIGMA_M] == 0.07
+    following.tick()
+    assert following.loop.pilot.state.memory[SIGMA_M] == math.inf
+
+
+@pytest.mark.parametrize("on_loss", ["surface", "drift"])
+def test_a_lost_vehicle_comes_to_an_end(on_loss: str) -> None:
+    flight = deepcopy(on_its_first_line(on_loss=on_loss))
+    begun_s = flight.now_s
+    while flight.loop.state != LinkState.OVER and flight.now_s < begun_s + 3600.0:
+        flight.tick(odometry="none")
+    assert flight.loop.state == LinkState.OVER
+    # Three times the 60 s that 6 m take at the slowest rate of ascent.
+    assert flight.now_s - begun_s == pytest.approx(0.5 + 5.0 + 180.0, abs=1.0)
+    assert is_off(flight)
+    assert flight.truth[2] > -0.2
+
+
 @pytest.mark.parametrize("jump_s", [-30.0, 0.8, 3600.0])
 def test_clock_that_jumps_is_survived(following: LoopFlight, jump_s: float) -> None:
     """What was heard before the jump is forgotten; odometry on the new clock is flown by."""
@@ -183,8 +268,7 @@ def test_thruster_that_stands_still_is_found(following: LoopFlight) -> None:
 
 
 def test_drift_leaves_the_thrusters_off() -> None:
-    flight = LoopFlight(on_loss="drift")
-    flight.until("follow")
+    flight = deepcopy(on_its_first_line(on_loss="drift"))
     flight.ticks(10 + GRACE_TICKS + 200, odometry="none")
     assert flight.command.state == LinkState.GIVEN_UP
     assert is_off(flight)

@@ -39,7 +39,7 @@ class Sink:
 
 
 class Vehicle:
-    """Packets of a submarine that lies still at a place, through the protocol's own encoder."""
+    """Packets of a submarine that stays at a place, through the protocol's own encoder."""
 
     def __init__(self, system: int = 1, **limits: object) -> None:
         plan = small_plan()
@@ -67,7 +67,8 @@ class Vehicle:
 
     def motion(self, *, north: float = -1.6, depth: float = 4.0, late_s: float = 0.0) -> None:
         stamp = round((self.boot_s - late_s) * 1e3)
-        self.say(self.own.attitude_encode(stamp, 0.0, 0.0, 0.3, 0.0, 0.0, 0.0))
+        roll = 1e-5 * math.sin(stamp)  # what lies still to the last bit is not flown
+        self.say(self.own.attitude_encode(stamp, roll, 0.0, 0.3, 0.0, 0.0, 0.0))
         self.say(self.own.rangefinder_encode(FLOOR_M - depth, 0.0))
         self.say(self.own.local_position_ned_encode(stamp, north, 0.0, depth, 0.0, 0.0, 0.0))
 
@@ -90,17 +91,22 @@ class Vehicle:
 @pytest.fixture
 def flying() -> Vehicle:
     """A vehicle that is being flown."""
+    return flown()
+
+
+def flown(**motion: float) -> Vehicle:
     vehicle = Vehicle()
     vehicle.heartbeat()
     vehicle.origin()
-    vehicle.step(20)
+    vehicle.step(20, **motion)
     assert vehicle.mission.loop.state == LinkState.FLYING
     vehicle.targets()
     return vehicle
 
 
-def test_setpoints_are_velocities_in_ned_and_a_heading(flying: Vehicle) -> None:
+def test_setpoints_are_velocities_in_ned_and_a_heading() -> None:
     """The vehicle is 1 m above the wanted depth, 2 m off the start: it is sent down and there."""
+    flying = flown(north=-3.0, depth=2.5)
     flying.step(1, north=-3.0, depth=2.5)
     (target,) = flying.targets()
     assert (target.target_system, target.target_component) == (1, 1)

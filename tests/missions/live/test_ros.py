@@ -277,9 +277,10 @@ class Navigator:
         )  # fmt: skip
 
     def publish(self, depth: float) -> None:
+        stamp_s = self.node.get_clock().now().nanoseconds * 1e-9
         odometry = Odometry(
-            stamp_s=self.node.get_clock().now().nanoseconds * 1e-9,
-            position_ned=np.array([0.0, 0.0, depth]),
+            stamp_s=stamp_s,
+            position_ned=np.array([1e-4 * math.sin(stamp_s), 0.0, depth]),
             quaternion_xyzw=np.array([0.0, 0.0, 0.0, 1.0]),
             velocity_body=np.zeros(3),
             rates_body=np.zeros(3),

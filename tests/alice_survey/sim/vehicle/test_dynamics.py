@@ -13,10 +13,13 @@ from scipy.spatial.transform import Rotation
 
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle import dynamics
+from alice_survey.sim.vehicle.propulsion import add_thrust
 from alice_survey.sim.vehicle.sea import GRAVITY, Current, constant_current, sheared_current
 from alice_survey.sim.vehicle.vehicle import SETS, Vehicle, vehicle_from
 from tests import oracles_dynamics as oracle
 from tests.alice_survey.sim.vehicle import motions as m
+
+DEEP = (0.0, 0.0, 1000.0)
 
 VELOCITIES = arrays(np.float64, 6, elements=st.floats(-3.0, 3.0))
 ATTITUDES = st.tuples(st.floats(-3.1, 3.1), st.floats(-1.4, 1.4), st.floats(-3.1, 3.1))
@@ -225,7 +228,8 @@ def test_from_rest_the_speed_follows_a_hyperbolic_tangent(axis: int, newtons: fl
     """m u' = X + X_uu u |u|: u = u_T tanh(t sqrt(X |X_uu|) / m), u_T = sqrt(X / |X_uu|)."""
     vehicle = m.block({"X_uu": -15.0, "Y_vv": -320.0, "Z_ww": -200.0, "Y_vdot": -23.0})
     drag, mass = -vehicle.coefficients.quadratic[axis, axis], vehicle.mass[axis, axis]
-    states = m.advance(vehicle, m.state_of(vehicle), 30.0, 0.01, newtons * np.eye(6)[axis])
+    start = m.state_of(vehicle, position_ned=DEEP)
+    states = m.advance(vehicle, start, 30.0, 0.01, newtons * np.eye(6)[axis])
     time_s = np.arange(len(states)) * 0.01
     terminal = math.copysign(math.sqrt(abs(newtons) / drag), newtons)
     expected = terminal * np.tanh(time_s * math.sqrt(abs(newtons) * drag) / mass)
@@ -254,7 +258,8 @@ def test_terminal_speed_of_the_whole_vehicle(axis: int, newtons: float, coeffici
     # 0.5 m/s the Munk moment outweighs the low centre of gravity, and a pilot has to hold the nose;
     # in sway it turns the vehicle.)
     if axis == 2 or newtons == 0.6:
-        end = m.advance(vehicle, m.state_of(vehicle, 0.8 * nu, tilt), 150.0, 0.02, load)[-1]
+        start = m.state_of(vehicle, 0.8 * nu, tilt, DEEP)
+        end = m.advance(vehicle, start, 150.0, 0.02, load)[-1]
         assert end[7 + axis] == pytest.approx(speed, rel=2e-3)
         np.testing.assert_allclose(np.delete(end[7:13], axis), 0.0, atol=0.02)
 
@@ -371,7 +376,7 @@ def test_it_rises_slower_than_it_sinks_where_drag_differs() -> None:
     """At 1.277 times the drag upwards the terminal speed is 13 % less, as of the paper's ALICE."""
     vehicle = m.block({"Z_ww_pos": -200.0, "Z_ww_neg": -1.277 * 200.0, "Y_vv": -300.0})
     ends = [
-        m.advance(vehicle, m.state_of(vehicle), 60.0, 0.02, newtons * m.W)[-1, 9]
+        m.advance(vehicle, m.state_of(vehicle, position_ned=DEEP), 60.0, 0.02, newtons * m.W)[-1, 9]
         for newtons in (5.0, -5.0)
     ]
     assert ends[0] == pytest.approx(math.sqrt(5.0 / 200.0), rel=1e-6)
@@ -383,6 +388,33 @@ def test_it_rises_slower_than_it_sinks_where_drag_differs() -> None:
         constant_current(0.0, 0.0),
     )  # fmt: skip
     np.testing.assert_allclose(m.rates(vehicle, turning)[7:13], expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("held_up", ["by a push", "by thrusters"])
+def test_it_comes_to_rest_at_the_surface(held_up: str) -> None:
+    """A push upwards lifts the hull out by as much as the buoyancy that it loses there; thrusters
+    that push it up lose their water as well: F (1 - dry) = dry B."""
+    vehicle = vehicle_from("alice") if held_up == "by thrusters" else m.block({"Z_ww": -200.0})
+    load, command = np.zeros(6), np.zeros(vehicle.actuators)
+    if held_up == "by thrusters":
+        up = vehicle.configuration_matrix[2] < -0.5
+        down = vehicle.configuration_matrix[2] > 0.5
+        command[up], command[down] = 15.0, -15.0
+        assert np.any(up | down)
+    else:
+        load[2] = -50.0
+    start = m.state_of(vehicle, position_ned=(0.0, 0.0, 0.5))
+    states = m.advance(vehicle, start, 120.0, 0.01, load, command_rps=command)
+    body, at = vehicle.plant.body, states[-4000:].mean(axis=0)
+    dry = -at[2] / 0.2
+    pushed_n = -load[2]
+    if held_up == "by thrusters":
+        pushes = np.zeros(6)
+        add_thrust(vehicle.plant.propulsion, at[13:], np.zeros(6), pushes)
+        pushed_n = -pushes[2] * (1.0 - dry)
+    net_n = body.buoyancy_n - body.weight_n
+    assert pushed_n > 1.0
+    assert dry == pytest.approx((pushed_n + net_n) / body.buoyancy_n, rel=0.05)
 
 
 @pytest.mark.parametrize(
