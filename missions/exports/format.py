@@ -92,8 +92,11 @@ class Export:
         Raises:
             PlanError: the plan's depths do not fit its lines.
         """
-        rate_rad_s = self.options.turn_rate_rad_s
-        return [waypoints(self.plan, dive, self.mount, rate_rad_s) for dive in self.plan.dives]
+        rate_rad_s, by_depth = self.options.turn_rate_rad_s, self.plan.is_flown_by_depth
+        return [
+            waypoints(self.plan, dive, self.mount, rate_rad_s, by_depth=by_depth)
+            for dive in self.plan.dives
+        ]
 
     @cached_property
     def tolerance_m(self) -> float:
@@ -145,8 +148,8 @@ class ExportFormat:
     read_by: str
     """Programs that read it, in words."""
     files: tuple[ExportFile, ...]
-    keeps_altitude: bool = False
-    """Whether the vehicle keeps one altitude above the sea floor, as its altimeter measures it."""
+    is_flown: bool = False
+    """Whether vehicles fly it: by altitude above the sea floor, or by depth."""
     read: Callable[[str], Mission | None] | None = None
     """Reads a mission from the text of a file, as the vehicle does; None where the text is of
     another format. A `ValueError` says what is wrong with it."""

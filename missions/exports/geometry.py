@@ -197,6 +197,10 @@ class CameraMount:
         """What the altimeter measures over a level sea floor."""
         return glass_altitude_m + self.glass_body_m[2] - self.altimeter_body_m[2]
 
+    def glass_altitude_m(self, altimeter_altitude_m: float) -> float:
+        """Height of the glass over a level sea floor."""
+        return altimeter_altitude_m - self.altimeter_altitude_m(0.0)
+
     @property
     def about(self) -> str:
         """The convention, in words, for people who read a file."""

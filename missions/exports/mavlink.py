@@ -86,6 +86,8 @@ def mission_items(
 def _waypoint(plan: Plan, point: Waypoint, stays_s: int, tolerance_m: float) -> Item:
     if point.kind == "surface":
         frame, altitude_m = FRAME_ABOVE_HOME, 0.0
+    elif plan.is_flown_by_depth:
+        frame, altitude_m = FRAME_ABOVE_HOME, -point.depth_m
     elif point.kind == "descend":
         lift_m = (_DESCENT_ALTITUDES - 1.0) * plan.altitude_m
         frame, altitude_m = FRAME_ABOVE_HOME, -max(0.0, point.depth_m - lift_m)

@@ -1,5 +1,6 @@
 """A dive as way-points: what every format of a mission is written from."""
 
+import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -11,7 +12,9 @@ from shapely.geometry import LineString, Point
 
 from alice_survey.core.errors import PlanError
 from alice_survey.core.frames import Array
+from missions.areas.bathymetry import Bathymetry
 from missions.exports.geometry import CameraMount, chords, line_depths
+from missions.route.terrain import Reach, highest_floor
 from missions.values.costs import SETTLE_S
 from missions.values.legs import Leg
 from missions.values.plan_file import Dive, Plan
@@ -23,6 +26,10 @@ straight down and up."""
 
 DEPTH_STEP_M = 0.05
 """A line's depth is given wherever straight lines between way-points would miss it by more."""
+MAX_STEP_M = 0.25
+"""From way-point to way-point of a line that is flown by depth: followers go to the next depth at
+once, not along the straight to it."""
+_SAMPLE_M, _SAMPLE_RAD = 0.25, math.radians(10.0)
 _STRAIGHT_RAD = 1e-6
 _TINY_M = 1e-6
 _TOUCH_M = 1e-6
@@ -49,7 +56,8 @@ class Waypoint:
     depth_m: float
     """Depth of the reference point below the surface."""
     altitude_m: float
-    """Height of the altimeter above the sea floor."""
+    """Height of the altimeter above the sea floor; NaN where a plan over a bathymetry does not know
+    it."""
     glass_depth_m: float
     speed_mps: float
     hold_s: float
@@ -62,12 +70,13 @@ class _Point(NamedTuple):
     heading_rad: float
     line: int = -1
     glass_depth_m: float | None = None
+    altitude_m: float = math.nan
     hold_s: float = 0.0
     camera: Literal["on", "off"] | None = None
 
 
 def waypoints(
-    plan: Plan, dive: Dive, mount: CameraMount, turn_rate_rad_s: float
+    plan: Plan, dive: Dive, mount: CameraMount, turn_rate_rad_s: float, *, by_depth: bool = False
 ) -> tuple[Waypoint, ...]:
     """The way-points of a dive, from the surface to the surface.
 
@@ -79,6 +88,7 @@ def waypoints(
         dive: one of the plan's.
         mount: of the camera on the vehicle.
         turn_rate_rad_s: of turns on the spot.
+        by_depth: with way-points on lines wherever their depth changes by `MAX_STEP_M`.
 
     Raises:
         PlanError: depths do not fit the lines.
@@ -86,8 +96,10 @@ def waypoints(
     depths = line_depths(plan)
     if not dive.route.legs:
         raise PlanError("a dive has no legs: plan again")
-    points = _switch_camera(list(_points(plan, dive, turn_rate_rad_s, depths)))
+    points = _switch_camera(list(_points(plan, dive, turn_rate_rad_s, depths, by_depth)))
     points = _with_depths(points, plan, depths)
+    if by_depth:
+        points = list(_rising_first(points))
     glass_ne = np.array([point.place_ne_m for point in points])
     headings = np.array([point.heading_rad for point in points])
     vehicle_ne = mount.vehicle_ne(glass_ne, headings)
@@ -109,7 +121,9 @@ def waypoints(
                 glass_longitude_deg=float(glass_geodetic[i, 1]),
                 heading_rad=point.heading_rad % (2 * math.pi),
                 depth_m=0.0 if at_surface else mount.vehicle_depth_m(float(glass_depths[i])),
-                altitude_m=mount.altimeter_altitude_m(plan.altitude_m),
+                altitude_m=mount.altimeter_altitude_m(
+                    point.altitude_m if by_depth else plan.altitude_m
+                ),
                 glass_depth_m=0.0 if at_surface else float(glass_depths[i]),
                 speed_mps=plan.speed_mps,
                 hold_s=point.hold_s,
@@ -119,7 +133,7 @@ def waypoints(
 
 
 def _points(
-    plan: Plan, dive: Dive, turn_rate_rad_s: float, depths: Sequence[Array]
+    plan: Plan, dive: Dive, turn_rate_rad_s: float, depths: Sequence[Array], by_depth: bool
 ) -> Iterator[_Point]:
     """Where each leg leads, in order."""
     legs = dive.route.legs
@@ -133,7 +147,7 @@ def _points(
                 hold_s = abs(leg.turn_rad) / turn_rate_rad_s + SETTLE_S
                 yield _Point("turn", leg.start_ne_m, heading, hold_s=hold_s)
         elif leg.line >= 0:
-            yield from _line_points(plan, leg, depths[leg.line])
+            yield from _line_points(plan, leg, depths[leg.line], by_depth)
         elif leg.side_rad:
             yield _Point("sway", leg.end_ne_m, heading, hold_s=SETTLE_S)
         elif leg.curvature_per_m:
@@ -144,13 +158,32 @@ def _points(
     yield _Point("surface", last.end_ne_m, last.end_heading_rad + last.side_rad)
 
 
-def _line_points(plan: Plan, leg: Leg, depths: Array) -> Iterator[_Point]:
-    """The end of a line, and places before it where its depth bends."""
+def _line_points(plan: Plan, leg: Leg, depths: Array, by_depth: bool) -> Iterator[_Point]:
+    """The end of a line, and places before it where its depth bends, or changes by a step."""
     line = plan.lines[leg.line]
     along_m = np.linspace(0.0, line.length_m, line.stations)
-    for i in bends(along_m, depths, DEPTH_STEP_M)[1:] or [0]:
+    kept = bends(along_m, depths, DEPTH_STEP_M)
+    if by_depth:
+        kept = _with_steps(kept, depths)
+    for i in kept[1:] or [0]:
         north, east = line.stations_ne[i].tolist()
-        yield _Point("line", (north, east), leg.heading_rad, leg.line, float(depths[i]))
+        floor_m = plan.line_floors_m[leg.line][i] if plan.line_floors_m else math.nan
+        depth_m = float(depths[i])
+        yield _Point(
+            "line", (north, east), leg.heading_rad, leg.line, depth_m,
+            altitude_m=floor_m - depth_m,
+        )  # fmt: skip
+
+
+def _with_steps(kept: list[int], depths: Array) -> list[int]:
+    """Indices with more between them, so that no depth is farther than a step from the next."""
+    rows = kept[:1]
+    for end in kept[1:]:
+        for i in range(rows[-1] + 1, end):
+            if abs(depths[i + 1] - depths[rows[-1]]) > MAX_STEP_M:
+                rows.append(i)
+        rows.append(end)
+    return rows
 
 
 def bends(along_m: Array, depths_m: Array, tolerance_m: float) -> list[int]:
@@ -226,6 +259,60 @@ def _with_depths(points: list[_Point], plan: Plan, line_depths: Sequence[Array])
     before = depths[known[np.clip(np.searchsorted(known, place, "right") - 1, 0, len(known) - 1)]]
     levels = np.minimum(before, after)
     return [p._replace(glass_depth_m=float(d)) for p, d in zip(points, levels, strict=True)]
+
+
+def _rising_first(points: Sequence[_Point]) -> Iterator[_Point]:
+    """Way-points with one more wherever the next is higher and away from a line: straight up."""
+    for before, point in itertools.pairwise([points[0], *points]):
+        up_m = float(before.glass_depth_m or 0.0) - float(point.glass_depth_m or 0.0)
+        if up_m > MAX_STEP_M and point.kind not in ("line", "surface"):
+            yield before._replace(
+                kind="way", camera=None, line=-1, glass_depth_m=point.glass_depth_m
+            )
+        yield point
+
+
+def least_clearance_by_depth(
+    plan: Plan,
+    dives: Sequence[Sequence[Waypoint]],
+    bathymetry: Bathymetry,
+    reach: Reach,
+    steepest_rad: float,
+) -> float:
+    """How near the sea floor the glass comes where way-points are flown by depth, m.
+
+    A follower goes down to the next depth at once, and up no steeper than the vehicle climbs, or
+    straight up. The highest floor within reach counts, as the vehicle turns from way-point to
+    way-point.
+
+    Args:
+        plan: of the dives.
+        dives: way-points of each, by depth.
+        bathymetry: of the sea floor.
+        reach: how far from the glass the floor counts.
+        steepest_rad: slope that the vehicle climbs.
+
+    Returns:
+        NaN where the floor is not known somewhere.
+    """
+    least_m = np.inf
+    for points in dives:
+        ne = plan.datum.ned_from_geodetic(
+            np.array([(p.glass_latitude_deg, p.glass_longitude_deg, 0.0) for p in points])
+        )[:, :2]
+        for i in range(1, len(points) - 1):
+            before, after = points[i - 1], points[i]
+            length_m = math.dist(ne[i - 1], ne[i])
+            turned_rad = math.remainder(after.heading_rad - before.heading_rad, 2 * math.pi)
+            count = max(math.ceil(length_m / _SAMPLE_M), math.ceil(abs(turned_rad) / _SAMPLE_RAD))
+            share = np.linspace(0.0, 1.0, count + 1)
+            climbed_m = before.glass_depth_m - math.tan(steepest_rad) * length_m * share
+            places = ne[i - 1] + share[:, None] * (ne[i] - ne[i - 1])
+            headings = before.heading_rad + share * turned_rad
+            floor_m = highest_floor(bathymetry, places, headings, reach)
+            clearance_m = floor_m - np.maximum(after.glass_depth_m, climbed_m)
+            least_m = np.minimum(least_m, clearance_m.min())
+    return float(least_m)
 
 
 def gone_on(plan: Plan, point: Waypoint, tolerance_m: float) -> Waypoint:

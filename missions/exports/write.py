@@ -19,8 +19,6 @@ from missions.exports.format import Export, ExportFormat, Options, line_toleranc
 from missions.exports.registry import format_named, format_names
 from missions.values.plan_file import Plan, read_plan
 
-MAX_ALTITUDE_DIFFERENCE_M = 0.3
-"""Between a plan's altitude and the one altitude of a mission, where the plan follows terrain."""
 SUMS = "SHA256SUMS"
 """File with the digests of the others, as `sha256sum --check` reads it."""
 
@@ -50,19 +48,19 @@ def write_exports(
 
     Raises:
         PlanError: a format is not known, the plan's depths do not fit its lines, or a chosen format
-            keeps one altitude where the plan does not. Where all formats are written, such ones are
+            is flown and comes too near the sea floor. Where all formats are written, such ones are
             left out with a warning.
     """
     names = format_names() if formats is None else list(formats)
     chosen = [format_named(name) for name in names]
-    refusal = altitude_refusal(plan)
-    if refusal and formats is not None and any(each.keeps_altitude for each in chosen):
+    refusal = depth_refusal(plan)
+    if refusal and formats is not None and any(each.is_flown for each in chosen):
         raise PlanError(refusal)
     export = Export(plan=plan, rig=rig, options=options or Options())
     folder.mkdir(parents=True, exist_ok=True)
     files: dict[Path, str] = {}
     for each in chosen:
-        if refusal and each.keeps_altitude:
+        if refusal and each.is_flown:
             _remove(folder, each)
         else:
             files |= each.write(folder, export)
@@ -71,6 +69,11 @@ def write_exports(
     files[folder / SUMS] = "digests of the others, for sha256sum --check"
     notes = _cola2(export, chosen=formats is not None) if "cola2" in names else []
     notes += _ardusub(export) if {"wpl", "qgc"} & set(names) else []
+    if plan.is_flown_by_depth and not refusal:
+        notes.append(
+            "Missions keep depths, not an altitude: their least clearance over the bathymetry is "
+            f"{plan.clearance_by_depth_m[0]:.2f} m. Check the tide, and the datum of the depths."
+        )
     if refusal:
         warn(f"missions are left out: {refusal}")
         notes = [f"Missions are left out: {refusal}."]
@@ -115,31 +118,24 @@ def check_exported(mission: Path) -> None:
             )
 
 
-def altitude_refusal(plan: Plan) -> str:
-    """Why no vehicle may fly a plan at one altitude above the sea floor; empty where it may.
-
-    A mission states one altitude, which the altimeter measures straight down. Over a bathymetry the
-    plan climbs ahead of what is higher, which such a vehicle does not.
-    """
+def depth_refusal(plan: Plan) -> str:
+    """Why no vehicle may fly a plan over its bathymetry; empty where one may."""
     if not plan.line_depths_m:
         return ""
-    terrain = plan.details.get("terrain") or {}
-    known = terrain.get("at_constant_altitude") or {}
-    difference_m = float(known.get("max_difference_m", math.nan))
-    clearance_m = float(known.get("min_clearance_m", math.nan))
-    if not math.isfinite(difference_m + clearance_m):
+    least_m, allowed_m = plan.clearance_by_depth_m
+    if not math.isfinite(allowed_m):
         return (
-            "the plan follows a bathymetry and does not say how far that is from one altitude: "
-            "plan again"
+            "the plan follows a bathymetry and does not say how near to it missions come: plan "
+            "again"
         )
-    if difference_m <= MAX_ALTITUDE_DIFFERENCE_M:
+    if not plan.is_flown_by_depth or least_m >= allowed_m:
         return ""
+    clearance = "an unknown clearance" if math.isnan(least_m) else f"{least_m:.2f} m of clearance"
     return (
-        f"COLA2, WPL and QGroundControl missions keep {plan.altitude_m:.2f} m of altitude, from "
-        f"which the plan over its bathymetry differs by up to {difference_m:.2f} m: the least "
-        f"clearance of such a mission is {clearance_m:.2f} m"
-        f"{' (it runs into the sea floor)' if clearance_m <= 0.0 else ''}. Leave the steep part "
-        "out of the area, or turn the lines along the slope (plan.line_heading_deg)"
+        f"between lines, missions for COLA2, WPL and QGroundControl would have {clearance} over "
+        f"the bathymetry, less than plan.least_clearance_m {allowed_m:g}: leave the steep part out "
+        "of the area, move plan.home_ne_m, or turn the lines along the slope "
+        "(plan.line_heading_deg)"
     )
 
 
@@ -293,7 +289,7 @@ def _ardusub(export: Export) -> list[str]:
         f"  WPNAV_SPEED {100.0 * plan.speed_mps:.0f} cm/s",
         f"  WPNAV_RADIUS {radius_cm} cm (the radii of files are ignored)",
         "  WP_YAW_BEHAVIOR 4 (default) or 1",
-        "  WPNAV_RFND_USE 1",
+        f"  WPNAV_RFND_USE {int(not plan.is_flown_by_depth)}",
     ]
     if plan.speed_mps < MIN_SPEED_MPS:
         lines.append(f"ArduSub flies {MIN_SPEED_MPS:g} m/s or faster: plan at that speed.")

@@ -16,12 +16,15 @@ from shapely.geometry import Point
 
 from alice_survey.core.config import AreaConfig, PlanConfig, SurveyConfig
 from alice_survey.core.errors import PlanError, keep_warnings, warn
+from alice_survey.sim.vehicle.pilot.settings import turn_in_place_rate_rad_s
 from alice_survey.sim.vehicle.vehicle import POINT, Hull
 from camera_calib.rig import Rig
 from missions.areas.bathymetry import Bathymetry, mean_depth_m, read_bathymetry
 from missions.areas.survey import survey_area
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.stations import MAX_ALTITUDES, Stations, stations_of_plan, sure_pattern
+from missions.exports.geometry import CameraMount
+from missions.exports.waypoints import least_clearance_by_depth, waypoints
 from missions.exposure.settings import ImagingSettings, ImagingSetup, imaging_settings
 from missions.exposure.strobe import raw_bytes
 from missions.plan.parts import plan_parts
@@ -35,6 +38,8 @@ from missions.values.line import Line
 from missions.values.pattern import Pattern
 from missions.values.plan_file import Plan
 
+ByStation = tuple[tuple[float, ...], ...]
+"""A value at each station of each line."""
 _ENOUGH = 0.999
 """Share of the area that is to be covered at the overlap requested; below, the plan warns."""
 
@@ -116,7 +121,7 @@ def plan_survey(config: SurveyConfig, rig: Rig, *, max_cells: int | None = None)
             max(stereo.port_m, stereo.starboard_m),
             max(stereo.ahead_m, stereo.astern_m),
         )
-        depths_m, figures = _terrain(lines, plan, reach, bathymetry)
+        depths_m, floors_m, figures = _terrain(lines, plan, reach, bathymetry)
         deepest_m, rating_m = max([below_m, *chain.from_iterable(depths_m)]), vehicle.depth_rating_m
         if rating_m is not None and deepest_m > rating_m:
             raise PlanError(
@@ -148,8 +153,11 @@ def plan_survey(config: SurveyConfig, rig: Rig, *, max_cells: int | None = None)
             energy_wh=sum(dive.energy_wh for dive in dives),
             coverage=math.nan,
             line_depths_m=depths_m,
+            line_floors_m=floors_m,
             details={},
         )
+        if bathymetry is not None and figures is not None:
+            figures["by_depth"] = _by_depth(laid, plan, bathymetry, reach, config)
         stations = _stations(laid, bathymetry)
         seen = certificate(area, rig, stations, pattern, max_cells=max_cells)
         if seen.share_at_overlap < _ENOUGH:
@@ -302,18 +310,40 @@ def area_bathymetry(settings: AreaConfig, area: Area, altitude_m: float) -> Bath
 
 def _terrain(
     lines: Sequence[Line], plan: PlanConfig, reach: terrain.Reach, bathymetry: Bathymetry | None
-) -> tuple[tuple[tuple[float, ...], ...], dict[str, Any] | None]:
-    """How lines follow a bathymetry: depths of the glass at each station, and figures."""
+) -> tuple[ByStation, ByStation, dict[str, Any] | None]:
+    """How lines follow a bathymetry: depths of glass and floor at each station, and figures."""
     if bathymetry is None:
-        return (), None
+        return (), (), None
     limits = terrain.TerrainLimits(
         altitude_m=plan.altitude_m,
         least_clearance_m=plan.least_clearance_m,
         steepest_rad=math.radians(plan.steepest_deg),
     )
     profiles = terrain.line_profiles(lines, bathymetry, reach, limits)
-    depths = tuple(tuple(round(float(d), 4) for d in p.depth_m) for p in profiles)
-    return depths, terrain.terrain_figures(profiles, limits, plan.relief_m)
+    depths, floors = (
+        tuple(tuple(round(float(d), 4) for d in getattr(p, name)) for p in profiles)
+        for name in ("depth_m", "floor_m")
+    )
+    return depths, floors, terrain.terrain_figures(profiles, limits, plan.relief_m)
+
+
+def _by_depth(
+    laid: Plan,
+    plan: PlanConfig,
+    bathymetry: Bathymetry,
+    reach: terrain.Reach,
+    config: SurveyConfig,
+) -> dict[str, float | None]:
+    """How near the sea floor vehicles come that fly the way-points by depth."""
+    camera, rate_rad_s = config.camera, turn_in_place_rate_rad_s(plan.turn_rate_limit_deg_s)
+    mount = CameraMount(
+        glass_body_m=camera.position_body_m, altimeter_body_m=camera.dvl_position_body_m
+    )
+    dives = [waypoints(laid, dive, mount, rate_rad_s, by_depth=True) for dive in laid.dives]
+    steepest_rad = math.radians(plan.steepest_deg)
+    least_m = least_clearance_by_depth(laid, dives, bathymetry, reach, steepest_rad)
+    known_m = least_m if math.isfinite(least_m) else None
+    return {"min_clearance_m": known_m, "least_allowed_m": plan.least_clearance_m}
 
 
 def _stations(plan: Plan, bathymetry: Bathymetry | None) -> Stations:

@@ -26,9 +26,12 @@ _NUMBERS = (
     "station_spacing_m", "turn_radius_m", "run_in_m",
     "length_m", "duration_s", "energy_wh", "coverage",
 )  # fmt: skip
+_BY_STATION = ("line_depths_m", "line_floors_m")
 
 
 _SAME_HOME_M = 0.01
+MAX_DIFFERENCE_M = 0.3
+"""Between a plan's altitude and that of a mission which keeps one over a bathymetry."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,6 +120,8 @@ class Plan:
     line_depths_m: tuple[tuple[float, ...], ...] = ()
     """Depth of the glass at each station of each line, where they follow a bathymetry; empty where
     the glass keeps its altitude above a level sea floor."""
+    line_floors_m: tuple[tuple[float, ...], ...] = ()
+    """Depth of the sea floor below each of these stations."""
     details: dict[str, Any]
     """Further facts for a reader; nothing is computed from it."""
 
@@ -124,6 +129,23 @@ class Plan:
     def allowed_offset_m(self) -> float:
         """How far off its line a picture may be: two neighbours so far apart just meet."""
         return 0.5 * (self.footprint_m[0] - self.line_spacing_m)
+
+    @property
+    def is_flown_by_depth(self) -> bool:
+        """Whether vehicles fly it by depth: one altitude would be too far from what is planned."""
+        return self._terrain("at_constant_altitude", "max_difference_m") > MAX_DIFFERENCE_M
+
+    @property
+    def clearance_by_depth_m(self) -> tuple[float, float]:
+        """Least clearance of way-points flown by depth, and the least allowed; NaN: not known."""
+        found = (self._terrain("by_depth", name) for name in ("min_clearance_m", "least_allowed_m"))
+        least_m, allowed_m = found
+        return least_m, allowed_m
+
+    def _terrain(self, part: str, name: str) -> float:
+        known = (self.details.get("terrain") or {}).get(part) or {}
+        value = known.get(name)
+        return math.nan if value is None else float(value)
 
     @property
     def blur_px(self) -> float:
@@ -174,7 +196,7 @@ class Plan:
             "stations": self.stations,
             "lines": [line.to_json() for line in self.lines],
             "dives": [dive.to_json() for dive in self.dives],
-            **({"line_depths_m": self.line_depths_m} if self.line_depths_m else {}),
+            **{name: getattr(self, name) for name in _BY_STATION if getattr(self, name)},
             "details": self.details,
         }
 
@@ -206,7 +228,10 @@ def read_plan(path: str | Path) -> Plan:
             footprint_m=(float(data["footprint_m"][0]), float(data["footprint_m"][1])),
             lines=_LINES.validate_python(data["lines"]),
             dives=tuple(Dive.from_json(dive) for dive in data["dives"]),
-            line_depths_m=tuple(tuple(map(float, row)) for row in data.get("line_depths_m", ())),
+            **{
+                name: tuple(tuple(map(float, row)) for row in data.get(name, ()))
+                for name in _BY_STATION
+            },
             details=dict(data["details"]),
             reached_forward_overlap=float(data["forward_overlap"]),
             reached_side_overlap=float(data["side_overlap"]),

@@ -27,7 +27,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from missions.exports.format import MIN_TOLERANCE_M, Export, ExportFile, ExportFormat
-from missions.exports.waypoints import Waypoint, gone_on, move, room_m
+from missions.exports.waypoints import MAX_STEP_M, Waypoint, gone_on, move, room_m
 from missions.exports.xml_text import (
     child,
     degrees,
@@ -72,6 +72,7 @@ def _steps(export: Export, points: tuple[Waypoint, ...]) -> Iterator[Cola2Step]:
         point, following = planned, points[i + 1] if i + 1 < len(points) else None
         leads_in = following is not None and following.kind in ("line", "run-in", "turn")
         near = math.dist(point.vehicle_ne_m, before.vehicle_ne_m) < 2.0 * ways_m
+        near = near and abs(point.depth_m - before.depth_m) < MAX_STEP_M
         idle = point.camera is None
         if idle and (point.kind == "turn" or (near and point.kind == "way" and not leads_in)):
             if following is not None and following.kind == "run-in":
@@ -139,7 +140,7 @@ def write_cola2(path: Path, export: Export, dive: int) -> None:
     child(root, "version", "2.0")
     for planned in _steps(export, export.dives[dive]):
         step = child(root, "mission_step")
-        _manoeuvre(step, planned)
+        _manoeuvre(step, planned, by_depth=export.plan.is_flown_by_depth)
         if planned.end.camera is not None:
             on, off = export.options.camera_on, export.options.camera_off
             action = child(child(step, "actions_list"), "action")
@@ -147,11 +148,11 @@ def write_cola2(path: Path, export: Export, dive: int) -> None:
     write_xml(path, root, _comment(export))
 
 
-def _manoeuvre(step: Element, planned: Cola2Step) -> None:
+def _manoeuvre(step: Element, planned: Cola2Step, *, by_depth: bool) -> None:
     """How a step is flown; a park holds place and heading, and is used to step sideways."""
     start, end = planned.start, planned.end
     parks = end.kind == "sway"
-    mode = {"descend": _BOTH, "surface": _DEPTH}.get(end.kind, _ALTITUDE)
+    mode = _DEPTH if by_depth else {"descend": _BOTH, "surface": _DEPTH}.get(end.kind, _ALTITUDE)
     values: dict[str, str | float] = {}
     if planned.is_section:
         values["initial_latitude"] = degrees(start.latitude_deg)
@@ -160,7 +161,7 @@ def _manoeuvre(step: Element, planned: Cola2Step) -> None:
     values["final_latitude"] = degrees(end.latitude_deg)
     values["final_longitude"] = degrees(end.longitude_deg)
     values["final_depth"] = metres(end.depth_m)
-    values["final_altitude"] = metres(end.altitude_m)
+    values["final_altitude"] = metres(0.0 if by_depth else end.altitude_m)
     if parks:
         values["final_yaw"] = f"{math.remainder(end.heading_rad, 2 * math.pi):.6f}"
         values["use_yaw"] = "true"
@@ -268,5 +269,5 @@ FORMAT = ExportFormat(
         ExportFile("mission_dive{}.xml", "COLA2 mission, version 2.0 (SPARUS II)", write_cola2),
     ),
     read=read_cola2,
-    keeps_altitude=True,
+    is_flown=True,
 )

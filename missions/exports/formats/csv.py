@@ -44,14 +44,17 @@ def _stations(plan: Plan) -> Iterator[dict[str, Any]]:
     number = itertools.count()
     dive_of, glass_m = dive_of_line(plan), plan.seafloor_depth_m - plan.altitude_m
     for index, (line, depths) in enumerate(zip(plan.lines, line_depths(plan), strict=True)):
+        floors = plan.line_floors_m[index] if plan.line_floors_m else depths + plan.altitude_m
         places = line.stations_ne
         places_deg = lat_lon(plan.datum, places, glass_m)
-        for (north, east), (lat, lon), depth in zip(places, places_deg, depths, strict=True):
+        for (north, east), (lat, lon), depth, floor in zip(
+            places, places_deg, depths, floors, strict=True
+        ):
             yield {
                 "station": next(number), "dive": dive_of.get(index), "line": index,
                 "kind": line.kind, "latitude_deg": f"{lat:.10f}", "longitude_deg": f"{lon:.10f}",
                 "north_m": f"{north:.4f}", "east_m": f"{east:.4f}", "depth_m": f"{depth:.3f}",
-                "altitude_m": f"{plan.altitude_m:.3f}",
+                "altitude_m": f"{floor - depth:.3f}",
                 "heading_deg": f"{math.degrees(line.heading_rad):.6f}",
             }  # fmt: skip
 
@@ -63,17 +66,22 @@ def write_waypoints(path: Path, export: Export, _dive: int) -> None:
         {
             "number": number, "dive": dive, "latitude_deg": f"{p.glass_latitude_deg:.10f}",
             "longitude_deg": f"{p.glass_longitude_deg:.10f}", "depth_m": f"{p.glass_depth_m:.3f}",
-            "altitude_m": f"{export.plan.altitude_m:.3f}", "speed_mps": p.speed_mps,
+            "altitude_m": _known(export.mount.glass_altitude_m(p.altitude_m)),
+            "speed_mps": p.speed_mps,
             "heading_deg": f"{math.degrees(p.heading_rad):.4f}",
             "action": p.kind + (f", camera {p.camera}" if p.camera else ""),
             "line": p.line if p.line >= 0 else None, "hold_s": f"{p.hold_s:.1f}",
             "vehicle_latitude_deg": f"{p.latitude_deg:.10f}",
             "vehicle_longitude_deg": f"{p.longitude_deg:.10f}",
-            "vehicle_depth_m": f"{p.depth_m:.3f}", "altimeter_altitude_m": f"{p.altitude_m:.3f}",
+            "vehicle_depth_m": f"{p.depth_m:.3f}", "altimeter_altitude_m": _known(p.altitude_m),
         }
         for number, (dive, p) in enumerate(points, start=1)
     )  # fmt: skip
     _write(path, rows)
+
+
+def _known(metres: float) -> str:
+    return "" if math.isnan(metres) else f"{metres:.3f}"
 
 
 def _write(path: Path, rows: Iterator[dict[str, Any]]) -> None:

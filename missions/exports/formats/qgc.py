@@ -146,5 +146,5 @@ FORMAT = ExportFormat(
     read_by="QGroundControl, MAVSDK: mission, fence",
     files=(ExportFile("mission_dive{}.plan", "QGroundControl plan for ArduSub", write_qgc),),
     read=read_qgc,
-    keeps_altitude=True,
+    is_flown=True,
 )

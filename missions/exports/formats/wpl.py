@@ -50,5 +50,5 @@ FORMAT = ExportFormat(
     read_by="QGroundControl, Mission Planner, MAVProxy: QGC WPL 110",
     files=(ExportFile("mission_dive{}.waypoints", "QGC WPL 110 mission for ArduSub", write_wpl),),
     read=read_wpl,
-    keeps_altitude=True,
+    is_flown=True,
 )
