@@ -43,6 +43,7 @@ def _fly_summary(folder: Path) -> Summary:
         f"{_metres(line.cross_track_rms_m)} cross-track rms (the control's part "
         f"{_metres(line.believed_cross_track_rms_m)}), heading {_degrees(line.heading_rms_deg)} "
         f"rms; roll in turns to {_degrees(flight.in_turns.roll_worst_deg)}; "
+        f"{flight.clearance_least_m:.2f} m above the sea floor at least; "
         f"{sum(flight.energy_wh.values()):.1f} Wh; "
         f"{share(flight.coverage.share_at_overlap)} of the area covered as requested{promised}, "
         f"{share(flight.coverage.every_camera_share)} seen by every camera; "
@@ -132,6 +133,9 @@ PLAN = StageSpec(
 )
 
 
+_FLOOR = only("area", "seafloor_depth_m", "bathymetry_values", "crs")
+"""Of the area, what the simulated sea floor is made of, besides the file of a bathymetry."""
+
 FLY = StageSpec(
     name="fly",
     folder="flight",
@@ -157,12 +161,13 @@ FLY = StageSpec(
         "sea": without("sea", "current_file"),
         "navigation": "navigation",
         "seafloor": "seafloor",
-        "seafloor_depth_m": "area.seafloor_depth_m",
+        "floor": _FLOOR,
         "plan": "plan",
         "position_body_m": "camera.position_body_m",
         "dvl_position_body_m": "camera.dvl_position_body_m",
     },
     setting_files=(
+        "area.bathymetry_file",
         "sea.current_file",
         "vehicle.coefficients_file",
         "vehicle.file",
@@ -209,7 +214,7 @@ IMAGE = StageSpec(
     folder="images",
     command="image",
     about="the pictures: rendered, or real ones (`import-images`)",
-    version=5,
+    version=6,
     work="missions.acquire.run:run_images",
     takes=(
         "camera",
@@ -217,19 +222,20 @@ IMAGE = StageSpec(
         "imaging",
         "seafloor",
         "plan.altitude_m",
-        "area.seafloor_depth_m",
+        "area",
         "seed",
     ),
     needs=("plan", "fly"),
     settings={
         "seed": "seed",
-        "seafloor_depth_m": "area.seafloor_depth_m",
+        "floor": _FLOOR,
         "margins": only("plan", "altitude_m", "run_in_m", "turn_radius_m", "margin_m"),
         "camera": "camera",
         "water": without("water", "n_water_sigma"),
         "seafloor": "seafloor",
         "imaging": without("imaging", "pool_views"),
     },
+    setting_files=("area.bathymetry_file",),
     inputs=_image_inputs,
     summary=_pictures_summary,
     resumes=True,

@@ -17,7 +17,13 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.core.artefacts import atomic_path, write_csv, write_json
-from alice_survey.core.config import CameraConfig, ImagingConfig, SeafloorConfig, WaterConfig
+from alice_survey.core.config import (
+    AreaConfig,
+    CameraConfig,
+    ImagingConfig,
+    SeafloorConfig,
+    WaterConfig,
+)
 from alice_survey.core.errors import ImageError, NavigationError
 from alice_survey.core.executor import Executor
 from alice_survey.core.frames import Array, interpolate_poses, pose_to_json
@@ -36,11 +42,12 @@ from alice_survey.sim.seafloor.light import (
     nominal_gain,
 )
 from alice_survey.sim.seafloor.renderer import Scene, flat_floor_radiance, render
-from alice_survey.sim.seafloor.terrain import read_terrain, survey_terrain
+from alice_survey.sim.seafloor.terrain import read_terrain
 from alice_survey.sim.seafloor.texture import SAND_ALBEDO, survey_texture
 from camera_calib.camera import Camera
 from camera_calib.rig import Rig, read_rig, write_rig
 from camera_calib.water import water_optics
+from missions.fly.simulation import true_terrain
 from missions.logs.navigation_csv import read_navigation
 from missions.values.plan_file import read_plan
 
@@ -152,7 +159,7 @@ def run_images(
     imaging: ImagingConfig,
     seafloor: SeafloorConfig,
     altitude_m: float,
-    seafloor_depth_m: float,
+    area: AreaConfig,
     seed: int,
 ) -> None:
     """Take the pictures of a flown survey.
@@ -174,14 +181,7 @@ def run_images(
     rig = true_rig(camera, water, scale=imaging.scale, seed=seed)
     terrain = folder / "truth" / "terrain.ply"
     if not terrain.with_suffix(".json").exists():
-        floor = survey_terrain(
-            seafloor,
-            planned.area.allowed_corners_ne,
-            margin_m=altitude_m,
-            depth_m=seafloor_depth_m,
-            seed=seed,
-        )
-        floor.write(terrain)
+        true_terrain(planned, area, seafloor, altitude_m, seed).write(terrain)
     write_rig(folder / "truth" / "rig.json", rig)
     shoot = _Shoot(
         folder=folder,

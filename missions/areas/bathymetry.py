@@ -5,7 +5,7 @@ system; only the part that is needed is read.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -83,11 +83,34 @@ class Bathymetry:
         and direction are those in the middle of the places, true to 1e-4 of an offset over some
         kilometres.
         """
-        middle = (points_ne.min(axis=0) + points_ne.max(axis=0)) / 2
-        steps = self._pixel_from_ne(middle + np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))
-        per_metre = steps[1:] - steps[0]
+        _, per_metre = self._pixels_about((points_ne.min(axis=0) + points_ne.max(axis=0)) / 2)
         pixel = self._pixel_from_ne(points_ne)[:, None] + offsets_ne @ per_metre
         return self._depth_of_pixel(pixel.reshape(-1, 2)).reshape(offsets_ne.shape[:-1])
+
+    def depth_everywhere(self, points_ne: Array) -> Array:
+        """Depth, (N,), at places (N, 2) within some kilometres, as true as `depth_about`.
+
+        Where it is not known, that of the nearest cell that is.
+        """
+        middle = points_ne.mean(axis=0)
+        at, per_metre = self._pixels_about(middle)
+        rows, columns = self.depth_m.shape
+        pixel = at + (points_ne - middle) @ per_metre
+        return self._without_gaps._depth_of_pixel(np.clip(pixel, 0.5, [columns - 0.5, rows - 0.5]))
+
+    @cached_property
+    def _without_gaps(self) -> "Bathymetry":
+        from scipy.ndimage import distance_transform_edt
+
+        nearest = distance_transform_edt(
+            np.isnan(self.depth_m), return_distances=False, return_indices=True
+        )
+        return replace(self, depth_m=self.depth_m[tuple(nearest)])
+
+    def _pixels_about(self, place_ne: Array) -> tuple[Array, Array]:
+        """Column and row of a place, (2,), and what a metre north and east adds to them, (2, 2)."""
+        steps = self._pixel_from_ne(place_ne + np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))
+        return steps[0], steps[1:] - steps[0]
 
     def _depth_of_pixel(self, pixel: Array) -> Array:
         pixel = pixel - 0.5

@@ -77,7 +77,7 @@ from alice_survey.sim.vehicle.sea import (
     varying_current,
     with_swell,
 )
-from alice_survey.sim.vehicle.simulator import Flown, Setup, simulate
+from alice_survey.sim.vehicle.simulator import TICK_S, Flown, Setup, simulate
 from alice_survey.sim.vehicle.vehicle import Vehicle
 from camera_calib.rig import Rig
 from missions.coverage.certificate import certificate
@@ -85,6 +85,7 @@ from missions.coverage.stations import Stations, plan_pattern, stations_of_lines
 from missions.exports.follower import cola2_delta_m, cola2_settings, sways
 from missions.exports.geometry import CameraMount
 from missions.exports.registry import read_mission
+from missions.plan.planner import area_bathymetry
 from missions.route.energy import (
     flies_everywhere,
     flight_conditions,
@@ -150,14 +151,22 @@ def flight_noise(seed: int) -> np.random.Generator:
 
 def true_floor(plan: Plan, settings: FlightSettings) -> FloorGrid:
     """The simulated sea floor below a plan."""
-    return floor_grid(
-        survey_terrain(
-            settings.seafloor,
-            plan.area.allowed_corners_ne,
-            margin_m=settings.plan.altitude_m,
-            depth_m=settings.area.seafloor_depth_m,
-            seed=settings.seed,
-        )
+    altitude_m, seed = settings.plan.altitude_m, settings.seed
+    return floor_grid(true_terrain(plan, settings.area, settings.seafloor, altitude_m, seed))
+
+
+def true_terrain(
+    plan: Plan, area: AreaConfig, seafloor: SeafloorConfig, altitude_m: float, seed: int
+) -> Terrain:
+    """The simulated sea floor of a survey: on its bathymetry, where it has one."""
+    bathymetry = area_bathymetry(area, plan.area, altitude_m)
+    return survey_terrain(
+        seafloor,
+        plan.area.allowed_corners_ne,
+        margin_m=altitude_m,
+        depth_m=area.seafloor_depth_m,
+        seed=seed,
+        base=None if bathymetry is None else bathymetry.depth_everywhere,
     )
 
 
@@ -464,6 +473,7 @@ def flight_of(
         truth=truth,
         glass_ned=truth.ned_from_body.apply(glass_body),
         altitude_m=_altitude(setup.floor, truth.ned_from_body.apply(glass_body)),
+        clearance_m=_clearance_m(setup, truth.ned_from_body),
         believed_glass_ned=believed,
         line=line,
         trigger_s=trigger_s,
@@ -478,6 +488,13 @@ def _altitude(floor: FloorGrid, points_ned: Array) -> Array:
     """Height, (T,), of places above the sea floor below them."""
     depths = [floor_depth(floor, float(n), float(e)) for n, e in points_ned[:, :2]]
     return np.asarray(np.array(depths) - points_ned[:, 2])
+
+
+def _clearance_m(setup: Setup, ned_from_body: RigidTransform) -> float:
+    """Least height of hull, port and DVL above the sea floor, of every second."""
+    low, each = setup.sensors.low, ned_from_body[:: round(1.0 / TICK_S)]
+    points = np.vstack([each.apply(point) for point in low])
+    return float(_altitude(setup.floor, points).min())
 
 
 def navigation_log(flown: Flown) -> BelievedNavigation:

@@ -31,6 +31,8 @@ class Flight:
     """(T, 3) the left port's outer glass."""
     altitude_m: Array
     """(T,) true, of the left port's glass above the sea floor below it."""
+    clearance_m: float
+    """Least height of hull, port and DVL above the sea floor, of every second."""
     believed_glass_ned: Array
     """(T, 3) where navigation placed it."""
     line: Array
@@ -100,12 +102,10 @@ class Flight:
     @cached_property
     def outside_m(self) -> Array:
         """(T,) metres: how far the left port truly was out of the allowed area, or in a zone."""
-        places = shapely.points(self.glass_ned[:, :2])
+        places = np.asarray(shapely.points(self.glass_ned[:, :2]))
         allowed = self.plan.area.allowed
         shapely.prepare(allowed)
-        outside = np.zeros(len(places))
-        away = ~shapely.intersects(allowed, places)
-        outside[away] = shapely.distance(allowed, places[away])
+        outside: Array = shapely.distance(allowed, places)
         return outside
 
     def _cross_track(self, glass_ned: Array) -> Array:

@@ -10,10 +10,10 @@ from shapely.geometry import MultiPolygon, box
 
 from alice_survey.core.config import SurveyConfig, parse_config
 from alice_survey.core.frames import Array, Datum
-from alice_survey.sim.seafloor.terrain import Terrain, survey_terrain
+from alice_survey.sim.seafloor.terrain import Terrain
 from alice_survey.sim.vehicle.sea import FloorGrid, level_floor
 from camera_calib.rig import design_rig
-from missions.fly.simulation import flight_settings, simulate_plan
+from missions.fly.simulation import flight_settings, simulate_plan, true_terrain
 from missions.plan.planner import Planned, plan_survey
 from missions.values.area import Area
 from missions.values.flight import Flight
@@ -118,10 +118,4 @@ def off_stations_m(flight: Flight, glass_ned: Array) -> Array:
 
 def terrain_of(config: SurveyConfig, plan: Plan) -> Terrain:
     """The sea floor of a survey under a plan."""
-    return survey_terrain(
-        config.seafloor,
-        plan.area.allowed_corners_ne,
-        margin_m=config.plan.altitude_m,
-        depth_m=config.area.seafloor_depth_m,
-        seed=config.seed,
-    )
+    return true_terrain(plan, config.area, config.seafloor, config.plan.altitude_m, config.seed)

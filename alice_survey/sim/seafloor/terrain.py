@@ -10,7 +10,7 @@ in the plane of x and y join neck and shoulder.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -627,6 +627,7 @@ def build_terrain(
     bounds_ne_m: tuple[float, float, float, float],
     seafloor_depth_m: float,
     rng: np.random.Generator,
+    base: Callable[[Array], Array] | None = None,
 ) -> Terrain:
     """Make a sea floor.
 
@@ -635,6 +636,8 @@ def build_terrain(
         bounds_ne_m: least and greatest north, least and greatest east.
         seafloor_depth_m: mean depth of the sand.
         rng: source of all shapes.
+        base: depths, (...), at places, (..., 2) north and east, on which sand and rocks lie; level
+            if not given.
 
     Raises:
         ConfigError: the grid would be too large or too small.
@@ -665,12 +668,29 @@ def build_terrain(
         offset_ned=offset,
         grid_m=grid_m,
         corner_ne=corner,
-        depths=(-heights).astype(np.float32),
+        depths=_depths(heights, along_north, along_east, offset, base),
         material=np.where(rock > 0.01, rock, -trough_share(sand, grid_m)).astype(np.float32),
     )
     if not config.amphora:
         return terrain
     return replace(terrain, objects=(_lay_amphora(terrain, place_ne, object_rng),))
+
+
+def _depths(
+    heights: Array,
+    along_north: Array,
+    along_east: Array,
+    offset: Array,
+    base: Callable[[Array], Array] | None,
+) -> Floats:
+    """Depths about the offset's of (R, C) heights on a base, row by row."""
+    depths: Floats = (-heights).astype(np.float32)
+    if base is None:
+        return depths
+    east = along_east + offset[1]
+    for row, north in zip(depths, along_north + offset[0], strict=True):
+        row += base(np.column_stack([np.full(len(east), north), east])) - offset[2]
+    return depths
 
 
 @progress.step("make the sea floor")
@@ -681,6 +701,7 @@ def survey_terrain(
     margin_m: float,
     depth_m: float,
     seed: int,
+    base: Callable[[Array], Array] | None = None,
 ) -> Terrain:
     """The one sea floor of a survey: the same for all stages, from the settings alone.
 
@@ -690,12 +711,14 @@ def survey_terrain(
         margin_m: around that area: the altitude of the pictures.
         depth_m: mean depth.
         seed: seed of the survey.
+        base: as of `build_terrain`.
     """
     return build_terrain(
         seafloor,
         terrain_bounds(within_ne_m, margin_m),
         depth_m,
         np.random.default_rng([seed, _SEED_STREAM]),
+        base,
     )
 
 

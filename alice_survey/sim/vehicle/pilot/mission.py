@@ -451,8 +451,10 @@ def fly_mission(mission: PilotMission, tick: Tick) -> bool:
             )
     memory[slot.STEP_S] += dt_s
     sink_to(target, slope, tick)
+    last = leg + 1 == mission.steps.shape[0]
     # Until there is a floor a dive may take as long as it gets on.
-    report[slot.PHASE] = DIVE if memory[slot.FLOOR_KNOWN] == 0.0 or heave else FOLLOW
+    rises = heave and (leg == 0 or last)
+    report[slot.PHASE] = DIVE if memory[slot.FLOOR_KNOWN] == 0.0 or rises else FOLLOW
     report[slot.LINE] = step[LINE]
     dn, de = step[END_N] - memory[slot.FROM_N], step[END_E] - memory[slot.FROM_E]
     course = math.atan2(de, dn) if math.hypot(dn, de) > 1e-6 else estimate[vector.HEADING]
@@ -469,7 +471,6 @@ def fly_mission(mission: PilotMission, tick: Tick) -> bool:
         done = manoeuvre(step, away, mission.cola2, tick)
     else:
         done = to_waypoint(step, away, tick)
-    last = leg + 1 == mission.steps.shape[0]
     if heave and last and estimate[vector.DEPTH] < guidance.surface_m and step[DEPTH] == 0.0:
         done = True
     if not done:
