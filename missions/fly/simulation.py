@@ -4,7 +4,7 @@ The part of a plan that is flown: all its dives in one go, or one of them.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
@@ -92,6 +92,7 @@ from missions.route.energy import (
     plan_as_flown,
     sound_vehicle,
 )
+from missions.route.terrain import envelope
 from missions.values.flight import Flight, trigger_times
 from missions.values.legs import Leg, Route
 from missions.values.line import Line
@@ -246,7 +247,8 @@ def piloting_of(
             f"above {diverging_mps:.2f} m/s and is badly damped at the plan's {plan.speed_mps:g} "
             "m/s: lower the speed"
         )
-    path = path_of(plan)
+    steepest_rad = math.radians(settings.plan.steepest_deg)
+    path = path_of(plan, settings.camera.position_body_m[2], steepest_rad)
     turns = int(np.count_nonzero(path.turn_rad))
     if turns and mission.law == NO_LAW and settings.vehicle.controller == "los":
         warn(
@@ -254,8 +256,9 @@ def piloting_of(
             f"{turns} turns on the spot it swings off its place and drifts with the current; "
             "plan.turns = 'arcs' suits it better"
         )
+    floors_m = [floor for line in plan.line_floors_m for floor in line] or [plan.seafloor_depth_m]
     # A floor is followed down to two altitudes below the planned one.
-    deepest_m = plan.seafloor_depth_m + plan.altitude_m
+    deepest_m = max(floors_m) + plan.altitude_m
     reference = (0.0, 0.0, 0.0)
     followed_body_m = settings.camera.position_body_m if mission.law == NO_LAW else reference
 
@@ -273,7 +276,7 @@ def piloting_of(
                 deepest_m,
                 max_s=max_s,
                 blind_sigma_m=settings.navigation.blind_sigma_m,
-                blind_depth_m=max(plan.seafloor_depth_m - _BLIND_ALTITUDES * plan.altitude_m, 0.0),
+                blind_depth_m=max(min(floors_m) - _BLIND_ALTITUDES * plan.altitude_m, 0.0),
             ),
         )
         way_in_m = min(guidance.way_in_m, room_behind_m(plan, path, guidance.way_in_m))
@@ -860,8 +863,14 @@ def whole_route(plan: Plan) -> Route:
     return Route(legs=tuple(legs))
 
 
-def path_of(plan: Plan) -> PilotPath:
-    """The route of a plan for the pilot."""
+def path_of(plan: Plan, glass_down_m: float = 0.0, steepest_rad: float = 0.0) -> PilotPath:
+    """The route of a plan for the pilot.
+
+    Args:
+        plan: its depths over a bathymetry are the deepest of the path.
+        glass_down_m: how far the glass is below the origin.
+        steepest_rad: slope that the vehicle climbs.
+    """
     legs = whole_route(plan).legs
     return path_from_legs(
         [leg.start_ne_m for leg in legs],
@@ -873,7 +882,31 @@ def path_of(plan: Plan) -> PilotPath:
         plan.speed_mps,
         turn_rad=[leg.turn_rad for leg in legs],
         side_rad=[leg.side_rad for leg in legs],
+        profile=_profile(plan, legs, glass_down_m, steepest_rad) if plan.line_depths_m else None,
     )
+
+
+def _profile(
+    plan: Plan, legs: Sequence[Leg], glass_down_m: float, steepest_rad: float
+) -> tuple[Array, Array]:
+    """Distances along legs, and how deep the origin may be there: between lines as on the higher.
+
+    The vehicle climbs ahead of what is higher, at its slope.
+    """
+    at_m, depth_m, begins_m = list[Array](), list[Array](), 0.0
+    for leg in legs:
+        rows = plan.line_depths_m[leg.line] if leg.line >= 0 else (math.nan, math.nan)
+        at_m.append(begins_m + np.linspace(0.0, leg.length_m, len(rows)))
+        depth_m.append(np.array(rows))
+        begins_m += leg.length_m
+    along, depth = np.concatenate(at_m), np.concatenate(depth_m)
+    known = np.flatnonzero(np.isfinite(depth))
+    row = np.arange(len(depth))
+    after = depth[known[np.clip(np.searchsorted(known, row), 0, len(known) - 1)]]
+    before = depth[known[np.clip(np.searchsorted(known, row, "right") - 1, 0, len(known) - 1)]]
+    profile = envelope(along, np.minimum(before, after), math.tan(steepest_rad))
+    along, first = np.unique(along, return_index=True)
+    return along, profile[first] - glass_down_m
 
 
 def room_behind_m(plan: Plan, path: PilotPath, max_m: float) -> float:

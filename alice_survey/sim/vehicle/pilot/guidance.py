@@ -41,7 +41,14 @@ from alice_survey.sim.vehicle.pilot.mission import (
     PilotMission,
     fly_mission,
 )
-from alice_survey.sim.vehicle.pilot.path import MIN_SLANT, Path, advance, heading_at, place_at
+from alice_survey.sim.vehicle.pilot.path import (
+    MIN_SLANT,
+    Path,
+    advance,
+    deepest_m,
+    heading_at,
+    place_at,
+)
 from alice_survey.sim.vehicle.pilot.settings import Guidance, Tick, circle_course, turning_speed_mps
 from alice_survey.sim.vehicle.pilot.steering import (
     DEPTH_KEPT_M,
@@ -266,11 +273,13 @@ def _target_m(path: Path, guidance: Guidance, pilot: PilotState) -> float:
     """Requested depth of the origin: as deep as allowed without bottom lock until there is one.
 
     The smoothed sum of depth and altitude holds by how much the followed point is below the origin.
+    Never deeper than planned: over a known sea floor a plan climbs ahead of what is higher.
     """
+    planned_m = deepest_m(path, int(pilot.report[slot.LEG]), pilot.report[slot.ALONG])
     if pilot.memory[slot.FLOOR_KNOWN] == 0.0:
         limits = guidance.limits
-        return float(min(limits.blind_depth_m, limits.max_depth_m - _CAUTION_M))
-    return float(pilot.memory[slot.FLOOR] - path.altitude_m)
+        return float(min(limits.blind_depth_m, limits.max_depth_m - _CAUTION_M, planned_m))
+    return float(min(pilot.memory[slot.FLOOR] - path.altitude_m, planned_m))
 
 
 @kernel

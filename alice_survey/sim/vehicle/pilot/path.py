@@ -56,6 +56,11 @@ class Path(NamedTuple):
     """Target altitude of the followed point."""
     speed_mps: float
     """Target speed over ground, along the heading."""
+    profile_at_m: Array
+    """(K,) distances along the path, ascending, where the deepest depth is given; none: anywhere as
+    deep as the altitude has it."""
+    profile_m: Array
+    """(K,) deepest depth of the origin there."""
 
 
 def path_from_legs(
@@ -68,6 +73,7 @@ def path_from_legs(
     speed_mps: float,
     turn_rad: Sequence[float] | Array | None = None,
     side_rad: Sequence[float] | Array | None = None,
+    profile: tuple[Array, Array] | None = None,
 ) -> Path:
     """A path through legs.
 
@@ -82,6 +88,7 @@ def path_from_legs(
         turn_rad: (L,) of turns on the spot, else 0; there are none if left out.
         side_rad: (L,) heading minus course, +-pi/2 of sway steps, else 0; there are none if left
             out.
+        profile: as `Path.profile_at_m` and `Path.profile_m`.
 
     Raises:
         VehicleError: there is no leg, a value is out of range, or two legs do not join.
@@ -144,7 +151,31 @@ def path_from_legs(
         stop=(standing | np.append(standing[1:], False)).astype(np.float64),
         altitude_m=float(altitude_m),
         speed_mps=float(speed_mps),
+        profile_at_m=np.zeros(0) if profile is None else profile[0],
+        profile_m=np.zeros(0) if profile is None else profile[1],
     )
+
+
+@kernel
+def deepest_m(path: Path, leg: int, along_m: float) -> float:
+    """The deepest depth of the origin on the path; infinite where none is given."""
+    at_m, depth_m = path.profile_at_m, path.profile_m
+    low, high = 0, at_m.shape[0] - 1
+    if high < 0:
+        return math.inf
+    place = path.begins_m[leg] + along_m
+    if place <= at_m[0]:
+        return float(depth_m[0])
+    if place >= at_m[high]:
+        return float(depth_m[high])
+    while high - low > 1:
+        middle = (low + high) // 2
+        if at_m[middle] <= place:
+            low = middle
+        else:
+            high = middle
+    share = (place - at_m[low]) / (at_m[high] - at_m[low])
+    return float(depth_m[low] + share * (depth_m[high] - depth_m[low]))
 
 
 @kernel
