@@ -71,6 +71,8 @@ class _Point(NamedTuple):
     line: int = -1
     glass_depth_m: float | None = None
     altitude_m: float = math.nan
+    leg: int = 0
+    """Of the dive, that leads there."""
     hold_s: float = 0.0
     camera: Literal["on", "off"] | None = None
 
@@ -98,6 +100,8 @@ def waypoints(
         raise PlanError("a dive has no legs: plan again")
     points = _switch_camera(list(_points(plan, dive, turn_rate_rad_s, depths, by_depth)))
     points = _with_depths(points, plan, depths)
+    if plan.way_depths_m:
+        points = _over_terrain(points, plan.way_depths_m[plan.dives.index(dive)])
     if by_depth:
         points = list(_rising_first(points))
     glass_ne = np.array([point.place_ne_m for point in points])
@@ -145,17 +149,20 @@ def _points(
         if leg.length_m <= _TINY_M:
             if leg.turn_rad:
                 hold_s = abs(leg.turn_rad) / turn_rate_rad_s + SETTLE_S
-                yield _Point("turn", leg.start_ne_m, heading, hold_s=hold_s)
+                yield _Point("turn", leg.start_ne_m, heading, hold_s=hold_s, leg=index)
         elif leg.line >= 0:
-            yield from _line_points(plan, leg, depths[leg.line], by_depth)
+            for point in _line_points(plan, leg, depths[leg.line], by_depth):
+                yield point._replace(leg=index)
         elif leg.side_rad:
-            yield _Point("sway", leg.end_ne_m, heading, hold_s=SETTLE_S)
+            yield _Point("sway", leg.end_ne_m, heading, hold_s=SETTLE_S, leg=index)
         elif leg.curvature_per_m:
-            yield from _arc_points(leg)
+            for point in _arc_points(leg):
+                yield point._replace(leg=index)
         else:
             kind: Kind = "run-in" if _leads_to_line(leg, following) else "way"
-            yield _Point(kind, leg.end_ne_m, heading)
-    yield _Point("surface", last.end_ne_m, last.end_heading_rad + last.side_rad)
+            yield _Point(kind, leg.end_ne_m, heading, leg=index)
+    end_rad = last.end_heading_rad + last.side_rad
+    yield _Point("surface", last.end_ne_m, end_rad, leg=len(legs) - 1)
 
 
 def _line_points(plan: Plan, leg: Leg, depths: Array, by_depth: bool) -> Iterator[_Point]:
@@ -259,6 +266,18 @@ def _with_depths(points: list[_Point], plan: Plan, line_depths: Sequence[Array])
     before = depths[known[np.clip(np.searchsorted(known, place, "right") - 1, 0, len(known) - 1)]]
     levels = np.minimum(before, after)
     return [p._replace(glass_depth_m=float(d)) for p, d in zip(points, levels, strict=True)]
+
+
+def _over_terrain(points: Sequence[_Point], way_depths_m: Sequence[float]) -> list[_Point]:
+    """Way-points off lines, no deeper than the legs to and from them allow."""
+    raised = []
+    for point, following in itertools.pairwise([*points, points[-1]]):
+        if point.line < 0:
+            legs = {point.leg, following.leg}
+            allowed_m = min(way_depths_m[leg] for leg in legs)
+            point = point._replace(glass_depth_m=min(float(point.glass_depth_m or 0.0), allowed_m))
+        raised.append(point)
+    return raised
 
 
 def _rising_first(points: Sequence[_Point]) -> Iterator[_Point]:

@@ -893,18 +893,28 @@ def _profile(
 
     The vehicle climbs ahead of what is higher, at its slope.
     """
-    at_m, depth_m, begins_m = list[Array](), list[Array](), 0.0
+    allowed_m = {
+        id(leg): depth
+        for dive, depths in zip(plan.dives, plan.way_depths_m, strict=True)
+        for leg, depth in zip(dive.route.legs, depths, strict=True)
+    }
+    at_m, depth_m, limit_m, begins_m = list[Array](), list[Array](), list[Array](), 0.0
     for leg in legs:
-        rows = plan.line_depths_m[leg.line] if leg.line >= 0 else (math.nan, math.nan)
+        on_line = leg.line >= 0
+        rows = np.array(plan.line_depths_m[leg.line] if on_line else (math.nan, math.nan))
         at_m.append(begins_m + np.linspace(0.0, leg.length_m, len(rows)))
-        depth_m.append(np.array(rows))
+        depth_m.append(rows)
+        limit_m.append(
+            np.full(len(rows), math.inf if on_line else allowed_m.get(id(leg), math.inf))
+        )
         begins_m += leg.length_m
     along, depth = np.concatenate(at_m), np.concatenate(depth_m)
     known = np.flatnonzero(np.isfinite(depth))
     row = np.arange(len(depth))
     after = depth[known[np.clip(np.searchsorted(known, row), 0, len(known) - 1)]]
     before = depth[known[np.clip(np.searchsorted(known, row, "right") - 1, 0, len(known) - 1)]]
-    profile = envelope(along, np.minimum(before, after), math.tan(steepest_rad))
+    deepest = np.minimum(np.minimum(before, after), np.concatenate(limit_m))
+    profile = envelope(along, deepest, math.tan(steepest_rad))
     along, first = np.unique(along, return_index=True)
     return along, profile[first] - glass_down_m
 

@@ -157,6 +157,11 @@ def plan_survey(config: SurveyConfig, rig: Rig, *, max_cells: int | None = None)
             details={},
         )
         if bathymetry is not None and figures is not None:
+            ways_m = [
+                terrain.way_depths_m(dive.route.legs, bathymetry, reach, plan.altitude_m)
+                for dive in dives
+            ]
+            laid = replace(laid, way_depths_m=tuple(ways_m))
             figures["by_depth"] = _by_depth(laid, plan, bathymetry, reach, config)
         stations = _stations(laid, bathymetry)
         seen = certificate(area, rig, stations, pattern, max_cells=max_cells)

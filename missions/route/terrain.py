@@ -23,12 +23,15 @@ from alice_survey.core.errors import PlanError, warn
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.vehicle import Hull
 from missions.areas.bathymetry import Bathymetry
+from missions.values.legs import Leg
 from missions.values.line import Line
 
 _CHUNK = 200_000
 _PER_CELL = 2.0
 """Places looked at per cell of the bathymetry, each way."""
 _FINEST_M = 0.1
+_WAY_M, _TURN_RAD = 0.25, math.radians(10.0)
+"""Steps along a way, and of a turn."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -232,6 +235,24 @@ def line_profiles(
         )
         for index, line in enumerate(lines)
     ]
+
+
+def way_depths_m(
+    legs: Sequence[Leg], bathymetry: Bathymetry, reach: Reach, altitude_m: float
+) -> tuple[float, ...]:
+    """Deepest depth of the glass on each leg at an altitude above the highest floor within reach.
+
+    NaN where the floor is not known.
+    """
+    depths = []
+    for leg in legs:
+        turned_rad = leg.curvature_per_m * leg.length_m + leg.turn_rad
+        count = max(math.ceil(leg.length_m / _WAY_M), math.ceil(abs(turned_rad) / _TURN_RAD))
+        share = np.linspace(0.0, 1.0, count + 1)
+        headings = leg.heading_rad + leg.side_rad + share * turned_rad
+        floor_m = highest_floor(bathymetry, leg.places(share * leg.length_m), headings, reach)
+        depths.append(float(floor_m.min()) - altitude_m)
+    return tuple(depths)
 
 
 def terrain_figures(

@@ -26,7 +26,7 @@ _NUMBERS = (
     "station_spacing_m", "turn_radius_m", "run_in_m",
     "length_m", "duration_s", "energy_wh", "coverage",
 )  # fmt: skip
-_BY_STATION = ("line_depths_m", "line_floors_m")
+_OVER_TERRAIN = ("line_depths_m", "line_floors_m", "way_depths_m")
 
 
 _SAME_HOME_M = 0.01
@@ -122,6 +122,8 @@ class Plan:
     the glass keeps its altitude above a level sea floor."""
     line_floors_m: tuple[tuple[float, ...], ...] = ()
     """Depth of the sea floor below each of these stations."""
+    way_depths_m: tuple[tuple[float, ...], ...] = ()
+    """Deepest depth of the glass on each leg of each dive, where the plan follows a bathymetry."""
     details: dict[str, Any]
     """Further facts for a reader; nothing is computed from it."""
 
@@ -196,7 +198,7 @@ class Plan:
             "stations": self.stations,
             "lines": [line.to_json() for line in self.lines],
             "dives": [dive.to_json() for dive in self.dives],
-            **{name: getattr(self, name) for name in _BY_STATION if getattr(self, name)},
+            **{name: getattr(self, name) for name in _OVER_TERRAIN if getattr(self, name)},
             "details": self.details,
         }
 
@@ -230,7 +232,7 @@ def read_plan(path: str | Path) -> Plan:
             dives=tuple(Dive.from_json(dive) for dive in data["dives"]),
             **{
                 name: tuple(tuple(map(float, row)) for row in data.get(name, ()))
-                for name in _BY_STATION
+                for name in _OVER_TERRAIN
             },
             details=dict(data["details"]),
             reached_forward_overlap=float(data["forward_overlap"]),

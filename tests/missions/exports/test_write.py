@@ -1,24 +1,37 @@
 import csv
 import math
-import re
 import tracemalloc
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from alice_survey.core.artefacts import write_json
+from alice_survey.core.artefacts import read_csv, write_json
 from alice_survey.core.config import parse_config
 from alice_survey.core.errors import PlanError
 from missions.exports import formats
-from missions.exports.registry import format_names
-from missions.exports.waypoints import DEPTH_STEP_M, bends
+from missions.exports.geometry import CameraMount
+from missions.exports.registry import format_names, read_mission
+from missions.exports.waypoints import (
+    DEPTH_STEP_M,
+    bends,
+    least_clearance_by_depth,
+    waypoints,
+)
 from missions.exports.write import export_report, write_exports
-from missions.route.terrain import Reach, TerrainLimits, line_profiles, terrain_figures
+from missions.route.terrain import (
+    Reach,
+    TerrainLimits,
+    line_profiles,
+    terrain_figures,
+    way_depths_m,
+)
 from missions.values.plan_file import Plan
 from tests.missions.areas.sites import floor_of
-from tests.missions.exports.plans import RIG, small_plan
+from tests.missions.exports.plans import RIG, line, plan_of, small_plan
 from tests.missions.exports.readers import local_ne
 
 
@@ -134,40 +147,104 @@ def test_bends_keep_every_depth_within_the_tolerance() -> None:
 
 
 VEHICLES = ("cola2", "qgc", "wpl")
-CELL_M = 0.25
+CELL_M, STEEPEST_RAD = 0.25, math.radians(30.0)
 REACH = Reach(ahead_m=1.0, astern_m=1.0, aside_m=1.0)
 
 
-def plan_over(wall_m: float, slope: float = 0.0) -> Plan:
-    """The small plan over a floor 16 m deep that a wall raises east of 2 m."""
+def plan_over(wall_m: float, slope: float = 0.0, made: Callable[..., Plan] = small_plan) -> Plan:
+    """A plan over a floor 16 m deep that a wall raises east of 2 m."""
     east = (np.arange(160) + 0.5) * CELL_M - 20.0
     depth = np.broadcast_to(16.0 - slope * east - wall_m * (east > 2.0), (160, 160))
-    lines = small_plan().lines
-    limits = TerrainLimits(altitude_m=2.0, least_clearance_m=1.0, steepest_rad=np.deg2rad(30.0))
-    profiles = line_profiles(lines, floor_of(depth, CELL_M), REACH, limits)
+    floor, laid = floor_of(depth, CELL_M), made()
+    limits = TerrainLimits(altitude_m=2.0, least_clearance_m=1.0, steepest_rad=STEEPEST_RAD)
+    profiles = line_profiles(laid.lines, floor, REACH, limits)
+    depths, floors = (
+        tuple(tuple(map(float, getattr(profile, name))) for profile in profiles)
+        for name in ("depth_m", "floor_m")
+    )
+    ways = tuple(way_depths_m(dive.route.legs, floor, REACH, 2.0) for dive in laid.dives)
+    plan = made(
+        line_depths_m=depths, line_floors_m=floors, way_depths_m=ways, seafloor_depth_m=16.0
+    )
+    mount = CameraMount(glass_body_m=(0.55, -0.05, 0.08), altimeter_body_m=(-0.41, 0.0, 0.11))
+    dives = [waypoints(plan, dive, mount, 0.3, by_depth=True) for dive in plan.dives]
+    least_m = least_clearance_by_depth(plan, dives, floor, REACH, STEEPEST_RAD)
     figures = terrain_figures(profiles, limits, relief_m=10.0)
-    depths = tuple(tuple(map(float, profile.depth_m)) for profile in profiles)
-    return small_plan(line_depths_m=depths, seafloor_depth_m=16.0, details={"terrain": figures})
+    figures["by_depth"] = {"min_clearance_m": least_m, "least_allowed_m": 1.0}
+    return replace(plan, details={"terrain": figures})
 
 
 @pytest.mark.parametrize("format_", VEHICLES)
-def test_a_wall_is_refused_with_the_least_clearance(tmp_path: Path, format_: str) -> None:
+def test_a_wall_is_flown_by_depth(tmp_path: Path, format_: str) -> None:
+    """Followed by the rules of a vehicle that sinks at once and rises before it goes on, the file
+    keeps its clearance over a wall that knows nothing of the planner."""
     plan = plan_over(6.0)
-    with pytest.raises(PlanError, match="least clearance") as refused:
-        write_exports(tmp_path / "out", plan, RIG, formats=["csv", format_])
-    assert not (tmp_path / "out").exists()
-    # 2 m above the foot of a wall of 6 m is 4 m below its top.
-    clearance = re.search(r"least clearance of such a mission is (-?[\d.]+) m", str(refused.value))
-    assert clearance is not None
-    assert float(clearance[1]) == pytest.approx(-4.0, abs=0.05)
+    files = write_exports(tmp_path / "out", plan, RIG, formats=[format_])
+    assert plan.is_flown_by_depth
+    checked = 0
+    for file in files:
+        if not file.name.startswith("mission_"):
+            continue
+        mission = read_mission(file)
+        assert {step.heave for step in mission.steps} == {"depth"}
+        ends = mission.ends_ne(plan.datum)
+        for i in range(1, len(ends) - 1):
+            length_m = math.dist(ends[i - 1], ends[i])
+            along = np.linspace(0.0, 1.0, math.ceil(length_m / 0.05) + 1)
+            east = ends[i - 1][1] + along * (ends[i][1] - ends[i - 1][1])
+            climbed = mission.steps[i - 1].depth_m - math.tan(STEEPEST_RAD) * length_m * along
+            depth = np.maximum(mission.steps[i].depth_m, climbed)
+            assert np.all(np.where(east > 2.0, 10.0, 16.0) - depth > 1.5)
+            checked += 1
+    depths = [step.depth_m for step in mission.steps[1:-1]]
+    assert checked > 20
+    assert min(depths) == pytest.approx(8.0 - 0.08, abs=0.01)
+    assert max(depths) == pytest.approx(14.0 - 0.08, abs=0.01)
 
 
-def test_all_formats_leave_missions_of_a_wall_out(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_tables_state_the_altitude_that_is_flown(tmp_path: Path) -> None:
+    write_exports(tmp_path, plan_over(6.0), RIG, formats=["csv"])
+    _, rows = read_csv(tmp_path / "stations.csv")
+    floors = [16.0 - 6.0 * (float(row["east_m"]) > 2.0) for _, row in rows]
+    apart = [
+        abs(float(row["depth_m"]) + float(row["altitude_m"]) - floor)
+        for (_, row), floor in zip(rows, floors, strict=True)
+        if abs(float(row["east_m"]) - 2.0) > CELL_M
+    ]
+    assert max(apart) < 1e-3
+    assert max(float(row["altitude_m"]) for _, row in rows) > 5.0
+
+
+def test_a_way_home_over_a_wall_rises_first(tmp_path: Path) -> None:
+    """The lines end 14 m deep west of the wall; home is on top of it."""
+    west = [line((0.0, -8.0), (4.0, -8.0)), line((4.0, -7.0), (0.0, -7.0))]
+    plan = plan_over(6.0, made=partial(plan_of, west, [(0, 1)], home=(0.0, 6.0)))
+    write_exports(tmp_path, plan, RIG, formats=["csv", "cola2"])
+    assert plan.clearance_by_depth_m[0] > 1.5
+    _, rows = read_csv(tmp_path / "waypoints.csv")
+    depths = [float(row["depth_m"]) for _, row in rows[1:-1]]
+    assert depths[-1] == pytest.approx(8.0, abs=0.01) and max(depths) == pytest.approx(14.0)
+    # It is where the lines end that it rises.
+    places = [(row["latitude_deg"], row["longitude_deg"]) for _, row in rows[1:-1]]
+    risen = max(i for i in range(1, len(depths)) if depths[i - 1] > 9.0 > depths[i])
+    assert places[risen] == places[risen - 1]
+
+
+@pytest.mark.parametrize("least_m", [0.9, -4.0, None])
+def test_missions_that_come_too_near_the_floor_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], least_m: float | None
 ) -> None:
-    write_exports(tmp_path / "out", small_plan(), RIG)
+    plan = plan_over(6.0)
+    terrain = plan.details["terrain"] | {
+        "by_depth": {"min_clearance_m": least_m, "least_allowed_m": 1.0}
+    }
+    near = replace(plan, details={"terrain": terrain})
+    with pytest.raises(PlanError, match="clearance"):
+        write_exports(tmp_path / "out", near, RIG, formats=["csv", "cola2"])
+    assert not (tmp_path / "out").exists()
+    write_exports(tmp_path / "out", plan, RIG)
     assert list((tmp_path / "out").glob("mission_*"))
-    files = write_exports(tmp_path / "out", plan_over(6.0), RIG)
+    files = write_exports(tmp_path / "out", near, RIG)
     assert "missions are left out" in capsys.readouterr().err
     assert not list((tmp_path / "out").glob("mission_*"))
     assert {path.name for path in files} >= {"plan.kml", "waypoints.csv"}
@@ -175,20 +252,19 @@ def test_all_formats_leave_missions_of_a_wall_out(
 
 
 @pytest.mark.parametrize(
-    ("wall_m", "slope", "refused"),
+    ("wall_m", "slope", "by_depth"),
     [(0.0, 0.0, False), (0.25, 0.0, False), (0.4, 0.0, True), (0.0, 0.2, False), (0.0, 0.4, True)],
 )
-def test_floors_within_thirty_centimetres_are_exported(
-    tmp_path: Path, wall_m: float, slope: float, refused: bool
+def test_floors_within_thirty_centimetres_are_flown_by_altitude(
+    tmp_path: Path, wall_m: float, slope: float, by_depth: bool
 ) -> None:
     plan = plan_over(wall_m, slope)
     # The highest floor within reach of 1 m ahead and aside is as much higher as the slope says.
     stated = plan.details["terrain"]["at_constant_altitude"]
     assert stated["max_difference_m"] == pytest.approx(max(wall_m, slope), abs=0.06)
     assert stated["min_clearance_m"] == pytest.approx(2.0 - max(wall_m, slope), abs=0.06)
-    if refused:
-        with pytest.raises(PlanError, match="least clearance"):
-            write_exports(tmp_path / "out", plan, RIG, formats=["wpl"])
-        return
     files = write_exports(tmp_path / "out", plan, RIG, formats=list(VEHICLES))
     assert len(files) == 8
+    missions = [read_mission(file) for file in files if file.name.startswith("mission_")]
+    heaves = {step.heave for mission in missions for step in mission.steps[1:-1]}
+    assert heaves == {"depth" if by_depth else "altitude"}
