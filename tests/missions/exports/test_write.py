@@ -225,9 +225,10 @@ def test_a_way_home_over_a_wall_rises_first(tmp_path: Path) -> None:
     depths = [float(row["depth_m"]) for _, row in rows[1:-1]]
     assert depths[-1] == pytest.approx(8.0, abs=0.01) and max(depths) == pytest.approx(14.0)
     # It is where the lines end that it rises.
-    places = [(row["latitude_deg"], row["longitude_deg"]) for _, row in rows[1:-1]]
+    names = ("latitude_deg", "longitude_deg")
+    places = [[float(row[name]) for name in names] for _, row in rows[1:-1]]
     risen = max(i for i in range(1, len(depths)) if depths[i - 1] > 9.0 > depths[i])
-    assert places[risen] == places[risen - 1]
+    np.testing.assert_allclose(places[risen], places[risen - 1], atol=1e-8)
 
 
 @pytest.mark.parametrize("least_m", [0.9, -4.0, None])
