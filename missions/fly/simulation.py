@@ -913,7 +913,7 @@ def _profile(
     row = np.arange(len(depth))
     after = depth[known[np.clip(np.searchsorted(known, row), 0, len(known) - 1)]]
     before = depth[known[np.clip(np.searchsorted(known, row, "right") - 1, 0, len(known) - 1)]]
-    deepest = np.minimum(np.minimum(before, after), np.concatenate(limit_m))
+    deepest = np.fmin(np.minimum(before, after), np.concatenate(limit_m))  # not known: as between
     profile = envelope(along, deepest, math.tan(steepest_rad))
     along, first = np.unique(along, return_index=True)
     return along, profile[first] - glass_down_m

@@ -123,7 +123,7 @@ class Plan:
     line_floors_m: tuple[tuple[float, ...], ...] = ()
     """Depth of the sea floor below each of these stations."""
     way_depths_m: tuple[tuple[float, ...], ...] = ()
-    """Deepest depth of the glass on each leg of each dive, where the plan follows a bathymetry."""
+    """Deepest depth of the glass on each leg of each dive, over a bathymetry; NaN: not known."""
     details: dict[str, Any]
     """Further facts for a reader; nothing is computed from it."""
 
@@ -198,7 +198,11 @@ class Plan:
             "stations": self.stations,
             "lines": [line.to_json() for line in self.lines],
             "dives": [dive.to_json() for dive in self.dives],
-            **{name: getattr(self, name) for name in _OVER_TERRAIN if getattr(self, name)},
+            **{
+                name: [[None if math.isnan(depth) else depth for depth in row] for row in rows]
+                for name in _OVER_TERRAIN
+                if (rows := getattr(self, name))
+            },
             "details": self.details,
         }
 
@@ -231,7 +235,10 @@ def read_plan(path: str | Path) -> Plan:
             lines=_LINES.validate_python(data["lines"]),
             dives=tuple(Dive.from_json(dive) for dive in data["dives"]),
             **{
-                name: tuple(tuple(map(float, row)) for row in data.get(name, ()))
+                name: tuple(
+                    tuple(math.nan if depth is None else float(depth) for depth in row)
+                    for row in data.get(name, ())
+                )
                 for name in _OVER_TERRAIN
             },
             details=dict(data["details"]),

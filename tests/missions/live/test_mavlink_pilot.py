@@ -94,11 +94,11 @@ def flying() -> Vehicle:
     return flown()
 
 
-def flown(**motion: float) -> Vehicle:
+def flown(north: float = -1.6, depth: float = 4.0) -> Vehicle:
     vehicle = Vehicle()
     vehicle.heartbeat()
     vehicle.origin()
-    vehicle.step(20, **motion)
+    vehicle.step(20, north=north, depth=depth)
     assert vehicle.mission.loop.state == LinkState.FLYING
     vehicle.targets()
     return vehicle
