@@ -225,6 +225,14 @@ def read_plan(path: str | Path) -> Plan:
     try:
         if {key: data[key] for key in _FORMAT} != _FORMAT:
             raise PlanError(f"{path}: not a plan of version {_FORMAT['version']}; plan again")
+        values: dict[str, Any] = {name: float(data[name]) for name in _NUMBERS}
+        values |= {
+            name: tuple(
+                tuple(math.nan if depth is None else float(depth) for depth in row)
+                for row in data.get(name, ())
+            )
+            for name in _OVER_TERRAIN
+        }
         return Plan(
             name=str(data["name"]),
             area=Area.from_json(data["area"], Datum(**data["datum"])),
@@ -234,17 +242,10 @@ def read_plan(path: str | Path) -> Plan:
             footprint_m=(float(data["footprint_m"][0]), float(data["footprint_m"][1])),
             lines=_LINES.validate_python(data["lines"]),
             dives=tuple(Dive.from_json(dive) for dive in data["dives"]),
-            **{
-                name: tuple(
-                    tuple(math.nan if depth is None else float(depth) for depth in row)
-                    for row in data.get(name, ())
-                )
-                for name in _OVER_TERRAIN
-            },
             details=dict(data["details"]),
             reached_forward_overlap=float(data["forward_overlap"]),
             reached_side_overlap=float(data["side_overlap"]),
-            **{name: float(data[name]) for name in _NUMBERS},
+            **values,
         )
     except PlanError as error:
         named = str(error).startswith(str(path))
