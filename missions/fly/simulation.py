@@ -302,7 +302,8 @@ def piloting_of(
     ) -> tuple[Gains, Guidance]:
         known_ne = expected.current_ne_mps if current_ne_mps is None else current_ne_mps
         weak = vehicle.weaken(left)
-        if not flies_everywhere(replace(expected, vehicle=weak, current_ne_mps=known_ne)):
+        left_to_fly = replace(expected, vehicle=weak, current_ne_mps=known_ne)
+        if not weak.thrusters or not flies_everywhere(left_to_fly):
             raise VehicleError(f"{vehicle.name} cannot fly the plan with the thrust it has left")
         return pilot_with(left)
 

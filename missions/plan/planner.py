@@ -14,7 +14,7 @@ import numpy as np
 import shapely.ops
 from shapely.geometry import Point
 
-from alice_survey.core.config import AreaConfig, PlanConfig, SurveyConfig
+from alice_survey.core.config import AreaConfig, CameraConfig, PlanConfig, SurveyConfig
 from alice_survey.core.errors import PlanError, keep_warnings, warn
 from alice_survey.sim.vehicle.pilot.settings import turn_in_place_rate_rad_s
 from alice_survey.sim.vehicle.vehicle import POINT, Hull
@@ -162,7 +162,7 @@ def plan_survey(config: SurveyConfig, rig: Rig, *, max_cells: int | None = None)
                 for dive in dives
             ]
             laid = replace(laid, way_depths_m=tuple(ways_m))
-            figures["by_depth"] = _by_depth(laid, plan, bathymetry, reach, config)
+            figures["by_depth"] = _by_depth(laid, plan, bathymetry, reach, config.camera)
         stations = _stations(laid, bathymetry)
         seen = certificate(area, rig, stations, pattern, max_cells=max_cells)
         if seen.share_at_overlap < _ENOUGH:
@@ -337,10 +337,10 @@ def _by_depth(
     plan: PlanConfig,
     bathymetry: Bathymetry,
     reach: terrain.Reach,
-    config: SurveyConfig,
+    camera: CameraConfig,
 ) -> dict[str, float | None]:
     """How near the sea floor vehicles come that fly the way-points by depth."""
-    camera, rate_rad_s = config.camera, turn_in_place_rate_rad_s(plan.turn_rate_limit_deg_s)
+    rate_rad_s = turn_in_place_rate_rad_s(plan.turn_rate_limit_deg_s)
     mount = CameraMount(
         glass_body_m=camera.position_body_m, altimeter_body_m=camera.dvl_position_body_m
     )

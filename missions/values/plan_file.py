@@ -135,7 +135,8 @@ class Plan:
     @property
     def is_flown_by_depth(self) -> bool:
         """Whether vehicles fly it by depth: one altitude would be too far from what is planned."""
-        return self._terrain("at_constant_altitude", "max_difference_m") > MAX_DIFFERENCE_M
+        difference_m = self._terrain("at_constant_altitude", "max_difference_m")
+        return bool(self.line_depths_m) and not difference_m <= MAX_DIFFERENCE_M
 
     @property
     def clearance_by_depth_m(self) -> tuple[float, float]:

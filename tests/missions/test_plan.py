@@ -65,7 +65,7 @@ def test_the_papers_mission(capsys: pytest.CaptureFixture[str]) -> None:
     """15 x 17 m, lines 1 m apart, 2 m altitude, 0.2 m/s, 12.5 mm lens."""
     plan = planned(plan={"line_spacing_m": 1.0})
 
-    assert capsys.readouterr().err == ""
+    assert "warning" not in capsys.readouterr().err
     assert plan.footprint_m == pytest.approx((1.3976, 1.1193), abs=1e-4)
     assert plan.line_spacing_m == 1.0
     assert plan.reached_side_overlap == pytest.approx(0.2845, abs=1e-3)
@@ -145,7 +145,7 @@ def test_a_line_spacing_that_is_too_wide_is_kept_and_warned_of(
     assert plan.line_spacing_m == 1.3
     both = next(text for text in err.splitlines() if "side_overlap" in text)
     assert "7.0%" in both and "0.769 m" in both
-    assert all(text.startswith("warning: ") for text in err.splitlines())
+    assert both.startswith("warning: ")
     assert plan.coverage < 0.999
 
 

@@ -41,14 +41,7 @@ from alice_survey.sim.vehicle.pilot.mission import (
     PilotMission,
     fly_mission,
 )
-from alice_survey.sim.vehicle.pilot.path import (
-    MIN_SLANT,
-    Path,
-    advance,
-    deepest_m,
-    heading_at,
-    place_at,
-)
+from alice_survey.sim.vehicle.pilot.path import MIN_SLANT, Path, advance, heading_at, place_at
 from alice_survey.sim.vehicle.pilot.settings import Guidance, Tick, circle_course, turning_speed_mps
 from alice_survey.sim.vehicle.pilot.steering import (
     DEPTH_KEPT_M,
@@ -275,7 +268,18 @@ def _target_m(path: Path, guidance: Guidance, pilot: PilotState) -> float:
     The smoothed sum of depth and altitude holds by how much the followed point is below the origin.
     Never deeper than planned: over a known sea floor a plan climbs ahead of what is higher.
     """
-    planned_m = deepest_m(path, int(pilot.report[slot.LEG]), pilot.report[slot.ALONG])
+    at_m, planned_m = path.profile_at_m, math.inf
+    place = path.begins_m[int(pilot.report[slot.LEG])] + pilot.report[slot.ALONG]
+    low, high = 0, at_m.shape[0] - 1
+    while high - low > 1:
+        middle = (low + high) // 2
+        if at_m[middle] <= place:
+            low = middle
+        else:
+            high = middle
+    if high > 0:
+        share = min(max((place - at_m[low]) / (at_m[high] - at_m[low]), 0.0), 1.0)
+        planned_m = path.profile_m[low] + share * (path.profile_m[high] - path.profile_m[low])
     if pilot.memory[slot.FLOOR_KNOWN] == 0.0:
         limits = guidance.limits
         return float(min(limits.blind_depth_m, limits.max_depth_m - _CAUTION_M, planned_m))

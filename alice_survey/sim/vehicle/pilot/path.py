@@ -157,28 +157,6 @@ def path_from_legs(
 
 
 @kernel
-def deepest_m(path: Path, leg: int, along_m: float) -> float:
-    """The deepest depth of the origin on the path; infinite where none is given."""
-    at_m, depth_m = path.profile_at_m, path.profile_m
-    low, high = 0, at_m.shape[0] - 1
-    if high < 0:
-        return math.inf
-    place = path.begins_m[leg] + along_m
-    if place <= at_m[0]:
-        return float(depth_m[0])
-    if place >= at_m[high]:
-        return float(depth_m[high])
-    while high - low > 1:
-        middle = (low + high) // 2
-        if at_m[middle] <= place:
-            low = middle
-        else:
-            high = middle
-    share = (place - at_m[low]) / (at_m[high] - at_m[low])
-    return float(depth_m[low] + share * (depth_m[high] - depth_m[low]))
-
-
-@kernel
 def place_at(path: Path, leg: int, along_m: float) -> tuple[float, float, float, float]:
     """A place on the path.
 
