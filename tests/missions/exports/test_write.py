@@ -58,6 +58,7 @@ def test_every_format_is_written_the_same_twice(tmp_path: Path) -> None:
 def test_tables_do_not_hold_all_stations_at_once(tmp_path: Path) -> None:
     plan = small_plan()
     many = replace(plan, lines=(replace(plan.lines[0], stations=20_000), *plan.lines[1:]))
+    write_exports(tmp_path, plan, RIG, formats=["csv"])  # what it imports is not counted
     tracemalloc.start()
     write_exports(tmp_path, many, RIG, formats=["csv"])
     peak = tracemalloc.get_traced_memory()[1]
