@@ -74,6 +74,14 @@ def is_unknown(value: float) -> bool:
     return not abs(value) < BEYOND or value in UNKNOWN
 
 
+def where_unknown(values: "NDArray[np.float64]") -> "NDArray[np.bool_]":
+    """`is_unknown` of numbers, (...)."""
+    import numpy as np
+
+    found: NDArray[np.bool_] = ~(np.abs(values) < BEYOND) | np.isin(values, UNKNOWN)
+    return found
+
+
 def is_nowhere(latitude_deg: float | None, longitude_deg: float | None) -> bool:
     """Whether a place is that of a receiver without a fix."""
     return latitude_deg == 0.0 == longitude_deg

@@ -14,7 +14,7 @@ import numpy as np
 import shapely
 from shapely.geometry import MultiPolygon
 
-from alice_survey.core.contents import BEYOND, UNKNOWN, one_line
+from alice_survey.core.contents import UNKNOWN, one_line, where_unknown
 from alice_survey.core.errors import PlanError, warn, why
 from alice_survey.core.frames import Array, Datum
 
@@ -275,13 +275,13 @@ def _without_unknown(path: Path, band: Any) -> Any:
     """
     zero = band == 0
     far = np.ma.abs(band[~zero]) > _SHALLOW_M
-    unknown = [value for value in UNKNOWN if (band == value).any()]
-    unknown += [0.0] * bool(zero.mean() > _SOME and far.size and far.all())
+    is_zero_unknown = bool(zero.mean() > _SOME and far.size and far.all())
+    unknown = [value for value in UNKNOWN if (band == value).any()] + [0.0] * is_zero_unknown
     if unknown:
         names = " and ".join(f"{value:g}" for value in unknown)
         warn(f"{path}: holds {names}, taken for no data, which it does not declare")
-    beyond = ~(np.abs(np.ma.filled(band, 0).astype(np.float64)) < BEYOND)
-    return np.ma.masked_where(np.isin(np.ma.filled(band, 1), unknown) | beyond, band)
+    filled = np.ma.filled(band, 1)
+    return np.ma.masked_where(where_unknown(filled) | (is_zero_unknown & (filled == 0)), band)
 
 
 def _check_filled(path: Path, file: Any) -> None:

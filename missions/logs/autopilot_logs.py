@@ -64,6 +64,8 @@ _DOWN = 25
 """ROTATION_PITCH_270: a range finder that looks down."""
 _GOOD = 4
 """RangeFinder status: in range."""
+_MIN_QUALITY = 90
+"""Per cent of signal quality below which ArduSub ignores a range itself (its RNGFND_SQ_MIN)."""
 _SUBMARINE = 12
 _NO_VEHICLES = {0, 5, 6, 18, 26, 27, 30}
 """MAV_TYPE (mavlink.io/en/messages/minimal.html) of generic parts, antenna trackers, ground
@@ -121,6 +123,9 @@ class Source:
     """What to know of it when it is used."""
     sigma: Reader | None = None
     """What the vehicle states of its error, where it does."""
+    quality: tuple[str, float, float] = ("", -1, 0)
+    """Field of a quality in per cent, what stands for unknown (all others from 0 on are stated, and
+    this where any is), and the least of use."""
 
 
 _SIGMA_COLUMNS = {"navigation": "sigma_horizontal_m", "depth": "sigma_depth_m"}
@@ -194,14 +199,22 @@ def _signal(
         message = source.message
         if message not in log.tables or (name and message != name):
             continue
+        field, unknown, minimum = source.quality
         try:
             table, others = _one_instance(message, log.tables[message], instance)
+            quality = table.get(field, np.full(len(table["time_s"]), -1.0))
+            poor = (quality >= 0) & (quality < minimum) & ((quality != unknown) | quality.any())
+            if poor.any():
+                log.lost[f"{message}: of a {field} below {minimum:g} %"] += int(poor.sum())
+                table = table.rows(~poor)
             found = clean_signal(message, *source.read(table, log.tables), log.lost)
         except LackError as error:
             reason = str(error)
             continue
         if found is None:
             reason = "none of its rows can be used"
+            if poor.any():  # another message would repeat them without their quality
+                break
             continue
         sigma = None
         if source.sigma is not None:
@@ -300,12 +313,6 @@ def _hears_bottom(table: LogTable) -> Mask:
     return good
 
 
-def _hears_well(table: LogTable) -> Mask:
-    """The same of PX4: a quality of 0 is invalid, one of -1 not known. ArduSub's 0 is not known."""
-    good = _hears_bottom(table)
-    return good & (table["signal_quality"] != 0) if "signal_quality" in table else good
-
-
 _AT_SURFACE = "positions are GPS: they hold at the surface only"
 _BACKUP = "positions are those of the backup attitude filter"
 _DEGREES = float(np.rad2deg(1.0))
@@ -327,7 +334,9 @@ _BIN: Mapping[str, tuple[Source, ...]] = {
     "attitude": tuple(
         Source(message, take("Roll", "Pitch", "Yaw")) for message in ("ATT", "XKF1", "NKF1", "AHR2")
     ),
-    "altitude": (Source("RFND", take("Dist", where=_sees_down)),),
+    "altitude": (
+        Source("RFND", take("Dist", where=_sees_down), quality=("Quality", -1, _MIN_QUALITY)),
+    ),
     "velocity": tuple(Source(message, take("VN", "VE", "VD")) for message in ("XKF1", "NKF1")),
     "rates": (Source("RATE", take("R", "P", "Y", scale=float(np.deg2rad(1.0)))),),
     "pwm": (Source("RCOU", take(*(f"C{i}" for i in range(1, 9)))),),
@@ -344,7 +353,11 @@ _TLOG: Mapping[str, tuple[Source, ...]] = {
     ),
     "attitude": (Source("ATTITUDE", take("roll", "pitch", "yaw", scale=_DEGREES)),),
     "altitude": (
-        Source("DISTANCE_SENSOR", take("current_distance", scale=1e-2, where=_hears_bottom)),
+        Source(
+            "DISTANCE_SENSOR",
+            take("current_distance", scale=1e-2, where=_hears_bottom),
+            quality=("signal_quality", 0, _MIN_QUALITY),
+        ),
         Source("RANGEFINDER", take("distance", where=lambda t: t["distance"] != 0.0)),
     ),
     "velocity": (Source("GLOBAL_POSITION_INT", take("vx", "vy", "vz", scale=1e-2)),),
@@ -375,7 +388,13 @@ _ULG: Mapping[str, tuple[Source, ...]] = {
         ),
     ),
     "attitude": (Source("vehicle_attitude", _px4_attitude),),
-    "altitude": (Source("distance_sensor", take("current_distance", where=_hears_well)),),
+    "altitude": (
+        Source(
+            "distance_sensor",
+            take("current_distance", where=_hears_bottom),
+            quality=("signal_quality", -1, 1),
+        ),
+    ),
     "velocity": (Source(_LOCAL, take("vx", "vy", "vz", where=_velocity_holds)),),
     "rates": (Source("vehicle_angular_velocity", take(*(f"xyz[{i}]" for i in range(3)))),),
     "pwm": (Source("actuator_outputs", take(*(f"output[{i}]" for i in range(8)))),),

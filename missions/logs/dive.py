@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from alice_survey.core.contents import where_unknown
 from alice_survey.core.frames import Array, attitude_from_rotation, rotation_from_attitude
 from missions.logs.navigation_csv import interpolate
 
@@ -153,7 +154,10 @@ def clean_signal(source: str, time_s: Array, values: Array, lost: Counter[str]) 
     if not good.all():
         lost |= Counter({f"{source}: the time is not a number, or after 2200": int((~good).sum())})
     time_s, values = time_s[good], values[good]
-    values = np.where(np.isfinite(values), values, np.nan)
+    unknown = where_unknown(values)
+    if stated := int((unknown & np.isfinite(values)).sum()):
+        lost |= Counter({f"{source}: numbers that stand for unknown": stated})
+    values = np.where(unknown, np.nan, values)
     keep = _increasing(time_s)
     if len(keep) < len(time_s):
         lost |= Counter({f"{source}: the time repeats or goes back": len(time_s) - len(keep)})

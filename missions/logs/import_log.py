@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from alice_survey.core.artefacts import read_csv
-from alice_survey.core.contents import parse_number
+from alice_survey.core.contents import is_unknown, parse_number
 from alice_survey.core.errors import NavigationError, warn
 from alice_survey.core.frames import Array, Datum
 from missions.logs.autopilot_logs import (
@@ -197,6 +197,7 @@ def read_dive(path: Path, options: ImportOptions) -> LoggedDive:
         return read_ardusub_bin(path, chosen, datum)
     if suffix == ".tlog":
         return read_ardusub_tlog(path, chosen)
+    suffix = ".pd0" if first_bytes(path, 2) == b"\x7f\x7f" else suffix  # also .ENR, .ENX, .STA
     if suffix in _NOT_READ:
         raise NavigationError(f"{path}: {_NOT_READ[suffix]}")
     raise NavigationError(
@@ -425,11 +426,15 @@ def read_tide(text: str, *, dated: bool) -> float | Signal:
             f"--tide is neither metres nor a CSV of tides: {error}{undated}"
         ) from None
     table: list[tuple[float, float]] = []
+    unknown: list[int] = []
     for line, row in rows:
         cell, height = row[column], row["height_m"]
         try:
             time_s = utc_date(cell).timestamp() if dated else parse_number(cell)
-            table.append((time_s, parse_number(height)))
+            if is_unknown(metres := parse_number(height)):
+                unknown.append(line)
+                continue
+            table.append((time_s, metres))
         except ValueError:
             raise NavigationError(
                 f"{text} line {line}: {cell!r}, {height!r}: not a time and a height"
@@ -440,6 +445,8 @@ def read_tide(text: str, *, dated: bool) -> float | Signal:
             )
     if not table:
         raise NavigationError(f"{text}: holds no tides")
+    if unknown:
+        warn(f"{text}: {len(unknown)} heights from line {unknown[0]} on stand for unknown")
     times, heights = np.array(table).T
     return Signal(source=text, time_s=times, values=heights[:, None])
 

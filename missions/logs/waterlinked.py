@@ -3,8 +3,9 @@
 `velocity` reports hold vx, vy, vz (m/s; forward, right, down of the transducer), the range along
 its axis and when they were valid (`time_of_validity`, microseconds since 1970); `position_local`
 reports hold roll, pitch and yaw (degrees) at `ts` (seconds since 1970). Their own x, y and z are
-relative to the last reset and are not read. The maker's page "DVL protocol" describes formats
-json_v2 to json_v3.1.
+relative to the last reset and are not read. Reports of json_v1 are velocities without a `type`,
+whose times count from the report before. The maker's page "DVL protocol" describes json_v2 to
+json_v3.1.
 """
 
 import itertools
@@ -46,18 +47,22 @@ def read_waterlinked(path: Path) -> LoggedDive:
     lost: Counter[str] = Counter()
     velocities: list[list[float]] = []
     attitudes: list[list[float]] = []
-    since_s = 0.0
+    since_s, before = 0.0, None
     for report in _read_reports(path):
         if report is None:
             lost["lines that are no report"] += 1
         elif report["type"] == _ATTITUDE:
             attitudes.append([finite_number(report.get(k)) for k in ("ts", "roll", "pitch", "yaw")])
         elif report["type"] == _VELOCITY:
+            if report == before:  # a logger wrote it again: its time would count twice
+                lost["velocity reports that repeat the one before"] += 1
+                continue
+            before = report
             since_s += 1e-3 * np.nan_to_num(finite_number(report.get("time")))
-            row = [finite_number(report.get(k)) for k in ("vx", "vy", "vz", "altitude")]
+            row = [finite_number(report.get(k)) for k in ("vx", "vy", "vz", "altitude", "fom")]
             if report.get("velocity_valid") is not True:
                 lost["velocity reports without bottom lock"] += 1
-                row[:3] = [math.nan] * 3
+                row = [math.nan] * len(row)  # the maker: then neither velocity nor altitude holds
             if not row[3] > 0:
                 row[3] = math.nan
             valid_s = 1e-6 * finite_number(report.get("time_of_validity"))
@@ -72,6 +77,10 @@ def read_waterlinked(path: Path) -> LoggedDive:
             f"{path}: velocity reports have no time_of_validity, so attitudes cannot be tied to "
             "them: set the DVL's output to json_v3 or later"
         )
+    notes = ["velocities are of the transducer: forward, right and down have to be the body's"]
+    fom = table[np.isfinite(table[:, 6]), 6]
+    if len(fom):
+        notes.append(f"the DVL states errors of velocities (fom) of {np.median(fom):.2g} m/s")
     return LoggedDive(
         kind="reports of a Water Linked DVL",
         clock="the DVL's clock",
@@ -81,7 +90,7 @@ def read_waterlinked(path: Path) -> LoggedDive:
         altitude_slant=True,
         velocity_body=clean_signal(_VELOCITY, times, table[:, 2:5], lost),
         lost=dict(lost),
-        notes=("velocities are of the transducer: forward, right and down have to be the body's",),
+        notes=tuple(notes),
     )
 
 
@@ -92,8 +101,10 @@ def _read_reports(path: Path) -> Iterator[dict[str, Any] | None]:
             while line := file.readline(_MAX_LINE):
                 try:
                     report = json.loads(line) if line.strip() else {"type": "empty line"}
+                    if report.get("format") == "json_v1":
+                        report["type"] = _VELOCITY
                     yield report if report["type"] else None
-                except (ValueError, RecursionError, TypeError, KeyError):
+                except (ValueError, RecursionError, TypeError, KeyError, AttributeError):
                     yield None
     except OSError as error:
         raise NavigationError(f"{path}: cannot be read: {error.strerror}") from None

@@ -315,6 +315,27 @@ def test_a_ground_stations_log_becomes_navigation(tmp_path: Path, version: int) 
     np.testing.assert_allclose(vehicle.rates_body, [[0.01, 0.02, 0.03]] * 20, atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("stated", "kept"), [((0,), 20), ((95, 100), 20), ((0, 32, 95, 100), 10), ((0, 32), 0)]
+)
+def test_ranges_of_low_quality_are_left_out(
+    tmp_path: Path, stated: tuple[int, ...], kept: int
+) -> None:
+    """A 0 alone is MAVLink's "unknown"; RANGEFINDER repeats the ranges and knows no quality."""
+    records = telemetry()
+    ranges = [message for _, message in records if message.msgname == "DISTANCE_SENSOR"]
+    for i, message in enumerate(ranges):
+        message.signal_quality = stated[i % len(stated)]
+    records += [(t, mavlink.MAVLink_rangefinder_message(1.9, 0.0)) for t, _ in telemetry()[::4]]
+    log = tmp_path / "dive.tlog"
+    log.write_bytes(tlog(sorted(records, key=lambda record: record[0])))
+    left_out = imported(log)["left_out"]
+    altitude = numbers(tmp_path, "altitude_m")
+    assert list(left_out.values()) == [20 - kept] * (kept < 20)
+    assert np.isfinite(altitude).any() == (kept > 0)
+    assert "RANGEFINDER" not in str(left_out)
+
+
 def test_telemetry_of_other_systems_and_damage_are_counted(tmp_path: Path) -> None:
     records = telemetry()
     whole = tlog(records)
@@ -356,6 +377,7 @@ def test_telemetry_without_a_position(tmp_path: Path) -> None:
         ("text.log", "FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns"),
         ("nav.csv", "time_s,latitude_deg,longitude_deg,depth_m\n"),
         ("dvl.pd0", "\x7f\x7f"),
+        ("dvl.ENR", "\x7f\x7f"),
         ("dive.BIN", ""),
         ("a.tlog", "not a log at all, but long enough to be looked at"),
     ],

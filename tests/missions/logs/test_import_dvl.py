@@ -9,6 +9,7 @@ import pytest
 from alice_survey.core.errors import NavigationError
 from alice_survey.core.frames import Array, Datum, rotation_from_attitude
 from missions.logs.dead_reckoning import TrackErrors
+from missions.logs.import_log import ImportOptions, read_dive
 from missions.logs.ros_builder import flipped_quaternion
 from tests.missions.logs.log_files import Bag, imported, numbers
 from tests.missions.logs.test_import_bag import START
@@ -112,6 +113,27 @@ def test_reports_of_a_water_linked_dvl_close_the_circle(tmp_path: Path) -> None:
     np.testing.assert_allclose(altitude, 2.0 * np.cos(np.deg2rad(5.0)), atol=1e-6)
     assert data["dated"]
     assert data["left_out"] == {"lines that are no report": 1}
+
+
+def test_reports_of_json_v1_are_read(tmp_path: Path) -> None:
+    """Without types and dates; a logger wrote each three times, and bottom lock is lost once."""
+    lines = []
+    for i, v in enumerate(BODY_MPS[:50]):
+        held = i != 20
+        report = {"time": 1e3 * STEP_S + 1e-3 * i, "vx": v[0], "vy": v[1], "vz": v[2],
+                  "fom": 0.003, "altitude": 2.0 if held else -1.0, "velocity_valid": held,
+                  "status": 0, "format": "json_v1"}  # fmt: skip
+        lines += [json.dumps(report)] * 3
+    log = tmp_path / "dvl.txt"
+    log.write_text("\n".join(lines))
+    dive = read_dive(log, ImportOptions())
+    assert dive.velocity_body is not None and dive.altitude is not None and not dive.dated
+    np.testing.assert_allclose(dive.velocity_body.time_s, TIME_S[1:51], atol=2e-3)
+    expected = np.where(np.arange(50)[:, None] == 20, np.nan, BODY_MPS[:50])
+    np.testing.assert_allclose(dive.velocity_body.values, expected)
+    assert np.isnan(dive.altitude.values[:, 0]).nonzero()[0].tolist() == [20]
+    assert sorted(dive.lost.values()) == [1, 100]
+    assert any("0.003 m/s" in note for note in dive.notes)
 
 
 def test_velocities_of_the_world_are_refused(tmp_path: Path) -> None:
