@@ -7,7 +7,7 @@ import re
 from array import array
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from datetime import UTC, datetime, tzinfo
+from datetime import UTC, datetime, timedelta, tzinfo
 from pathlib import Path
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
@@ -23,6 +23,8 @@ POSITION, READINGS = COLUMNS[:3], COLUMNS[:7]
 """What a navigation log can measure; the other columns are sigmas."""
 IMAGE, HEIGHT = "image", "height_m"
 """Columns of tables by picture: its name, and the height above the vertical datum."""
+_DAY, _SINCE = "date", "time of the dive"
+"""Columns of dive computers: the day of a time of day, and minutes from that time on."""
 TURNING = ("roll_deg", "pitch_deg", "heading_deg", "longitude_deg")
 """Columns of angles that turn the short way round."""
 _RANGES = {
@@ -33,14 +35,15 @@ _RANGES = {
 _USUAL: Mapping[str, str] = {
     "latitude_deg": "latitude lat y/latitude gps_latitude gpslatitude",
     "longitude_deg": "longitude lon long lng x/longitude gps_longitude gpslongitude",
-    "depth_m": "depth water_depth vehicle_depth",
+    "depth_m": "depth water_depth vehicle_depth sample_depth",
     "heading_deg": "heading yaw hdg compass_heading",
     "roll_deg": "roll", "pitch_deg": "pitch",
     "altitude_m": "altitude alt height_above_bottom range_to_bottom dvl_altitude",
-    "time_utc": "timestamp utc datetime date_time date/time time utc_time",
+    "time_utc": "timestamp utc datetime date_time date/time time utc_time utc_t",
     "time_s": "unix_time epoch unixtime",
     IMAGE: "label filename file_name file image_name image_filename picture photo key",
     HEIGHT: "z/altitude",
+    _DAY: "date utc_d", _SINCE: "sample_time",
 }  # fmt: skip
 """Names that other programs give to columns, without units, in lower case."""
 DATED_AFTER_S, _DATED_BEFORE_S = 1e8, 1e11
@@ -197,7 +200,9 @@ def _usual_columns(path: Path, header: Sequence[str], *, by_picture: bool) -> di
     if not by_picture:
         found.pop(IMAGE, None)
     if "time_s" in found:
-        found.pop("time_utc", None)
+        found = {key: name for key, name in found.items() if key not in ("time_utc", _DAY, _SINCE)}
+    elif _DAY in found:
+        found.setdefault("time_utc", found[_DAY])
     lost = [one for one in bare if one and one not in found.values()]
     if lost:
         names = [name for name in (*own, *_USUAL) if name not in found]
@@ -211,7 +216,9 @@ def _usual_columns(path: Path, header: Sequence[str], *, by_picture: bool) -> di
 
 
 def _bare(name: str) -> str:
-    """A column's name without case, unit and marks."""
+    """A column's name without case, unit and marks; whole where the unit is another than ours."""
+    if re.search(r"[(\[]\s*(ft|feet|fsw|[cmk]m|rad|ms)\b", name, re.IGNORECASE):
+        return name.lower()
     name = re.sub(r"[(\[].*", "", name).strip("# ").lower()
     return re.sub(r"_(degrees|deg|m)$", "", re.sub(r"[\s-]+", "_", name))
 
@@ -245,7 +252,7 @@ def read_navigation(
         rows = (row for row, _ in itertools.pairwise(rows))
     at = _usual_columns(path, header, by_picture=by_picture)
     named = IMAGE in at
-    clocks = [name for name in ("time_s", "time_utc") if name in at]
+    clocks = [name for name in ("time_s", "time_utc", _SINCE) if name in at]
     lacks = [name for name in needed if name not in at]
     if not clocks and not named:
         lacks = ["time_s or time_utc" + (" or image" if by_picture else "")]
@@ -260,7 +267,7 @@ def read_navigation(
     faults: dict[str, list[int]] = {}
     for line, row in rows:
         try:
-            time = _time(row[at[clocks[0]]], clocks[0], zone) if clocks else math.nan
+            time = _time_of_row(row, at, clocks[0], zone) if clocks else math.nan
             if isinstance(time, datetime):
                 start_utc = start_utc or time
                 time = (time - start_utc).total_seconds()
@@ -318,6 +325,23 @@ def _number(cell: str, name: str) -> float:
     if not low <= value <= high:
         raise ValueError(f"{name} is {value}, not within {low} to {high}")
     return value
+
+
+def _time_of_row(
+    row: Mapping[str, str], at: Mapping[str, str], clock: str, zone: tzinfo
+) -> datetime | float:
+    """The time of a row; of a dive computer by a day, a time of day and minutes from then on."""
+    cell, since_s = row[at[clock]], 0.0
+    if _SINCE in at:
+        since_s, *parts = map(parse_number, row[at[_SINCE]].split(":"))
+        for part in parts or [0.0]:  # minutes, or minutes and seconds, or hours before them
+            since_s = 60.0 * since_s + part
+    if clock == _SINCE:
+        return since_s
+    if _DAY in at and re.match(r"\d{1,2}:", cell):
+        cell = f"{row[at[_DAY]].replace('/', '-')} {cell}"
+    time = _time(cell, clock, zone)
+    return time + timedelta(seconds=since_s) if isinstance(time, datetime) else time + since_s
 
 
 def _time(cell: str, clock: str, zone: tzinfo) -> datetime | float:

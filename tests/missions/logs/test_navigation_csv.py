@@ -182,6 +182,35 @@ def test_columns_that_are_not_read_are_named(
         read_navigation(log_file(tmp_path, "0,60,5", header="time_s,depth_m,depth_m"), UTC, ())
 
 
+DIVES = {
+    "Subsurface": (
+        '"dive number","date","time","sample time (min)","sample depth (m)","sample heartrate"',
+        [f'"7","2024-07-06","10:00:00","{cells}' for cells in ('0:20","3.5",""', '61:40","8",""',
+                                                               '0:01","0",""')],
+    ),
+    "unicsv": (
+        "No,Latitude,Longitude,Depth,Date,Time",
+        ["1,60,5,3.5,2024/07/06,10:00:20", "2,60,5,8,2024/07/06,11:01:40"],
+    ),
+    "hours": (
+        "date,time,sample time,depth", ["2024-07-06,10:00,0:00:20,3.5", "2024-07-06,10:00,1:01:40,8"],
+    ),
+    "feet": (
+        "date,time,depth (ft),depth", ["2024-07-06,10:00:20,9,3.5", "2024-07-06,11:01:40,9,8"],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", DIVES)
+def test_dive_computers_give_depths(tmp_path: Path, kind: str) -> None:
+    """Subsurface ends a dive with a row of its own at one second."""
+    header, rows = DIVES[kind]
+    log = read_navigation(log_file(tmp_path, *rows, header=header), find_zone("Europe/Oslo"), ())
+    assert log.start_utc == datetime(2024, 7, 6, 8, 0, 20, tzinfo=UTC)
+    np.testing.assert_allclose(log.time_s, [0, 3680])
+    np.testing.assert_allclose(log.columns["depth_m"], [3.5, 8.0])
+
+
 @pytest.mark.parametrize("cells", ["0,0,7,3", "60,5,-9999,3", "60,5,nan,3", "60,5,1e6,3"])
 def test_what_stands_for_unknown_is_no_value(tmp_path: Path, cells: str) -> None:
     header = "time_s,latitude_deg,longitude_deg,depth_m,altitude_m"
