@@ -14,6 +14,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 Array = NDArray[np.float64]
 
+_EARTH_M = 6_371_008.8
 BODY_FROM_NADIR_CAM = Rotation.from_matrix([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 """Nadir mount, image top towards the bow: x_cam = y_body, y_cam = -x_body, z_cam = z_body."""
 
@@ -83,6 +84,17 @@ class Datum:
         """EPSG code of the UTM zone (WGS 84) that holds the datum."""
         zone = min(int((self.longitude_deg + 180.0) // 6.0) + 1, 60)
         return (32600 if self.latitude_deg >= 0 else 32700) + zone
+
+
+def distances_m(first_deg: Array, second_deg: Array) -> Array:
+    """Distances, (N,) metres to 0.5 %, of places (N, 2) of latitude and longitude from others.
+
+    On a sphere by haversines (Sinnott 1984); what is not a place on Earth has a distance too.
+    """
+    first, second = np.deg2rad(first_deg), np.deg2rad(second_deg)
+    north, east = np.moveaxis(np.sin((first - second) / 2.0) ** 2, -1, 0)
+    level = np.abs(np.cos(first[..., 0]) * np.cos(second[..., 0]))
+    return np.asarray(2.0 * _EARTH_M * np.arcsin(np.sqrt(np.clip(north + level * east, 0.0, 1.0))))
 
 
 def rotation_from_attitude(roll_rad: Any, pitch_rad: Any, heading_rad: Any) -> Rotation:

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.core.contents import as_line, is_nowhere, one_line, ordinary_file
+from alice_survey.core.contents import as_line, is_nowhere, is_unknown, one_line, ordinary_file
 from alice_survey.core.errors import ImageError
 from camera_calib.picture_files import (
     KINDS,
@@ -327,7 +327,7 @@ def _angle(gps: Any, key: int, maximum: float) -> float | None:
 def _altitude(gps: Any) -> float | None:
     altitude = _number(gps.get(6))
     below = gps.get(5) in (1, b"\x01")
-    return None if not math.isfinite(altitude) else -altitude if below else altitude
+    return None if is_unknown(altitude) else -altitude if below else altitude
 
 
 def exif_focal_px(path: Path, width_px: int, height_px: int) -> float:

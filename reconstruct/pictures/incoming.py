@@ -23,7 +23,7 @@ from alice_survey.core.artefacts import read_csv
 from alice_survey.core.contents import as_line
 from alice_survey.core.errors import CalibrationError, ImageError, NavigationError, warn
 from alice_survey.core.executor import Executor, progress
-from alice_survey.core.frames import Array
+from alice_survey.core.frames import Array, distances_m
 from alice_survey.core.manifest import ImageRecord
 from alice_survey.core.records import PlaceRecord
 from camera_calib.calibrate.picture_sets import pair_pictures
@@ -709,6 +709,7 @@ def place_records(
         if origin:
             notes.append(f"picture times count from {origin}, plus the clock offset")
         records, level = _with_navigation(records, times, log, named), logged_level
+        _compare_with_exif(records, entries)
         depths = np.array([r.depth_m for r in records if r.readings["depth"]])
         if level == _LOGGED_LEVEL and len(depths) and np.median(depths) < -_ABOVE_M:
             warn(
@@ -739,6 +740,30 @@ def place_records(
         return records, None, level
     place = PlaceRecord(latitude_deg=first.latitude_deg, longitude_deg=first.longitude_deg)
     return records, place, level
+
+
+_FAR_M, _FAR_SIGMAS = 100.0, 5.0
+
+
+def _compare_with_exif(records: Sequence[ImageRecord], entries: Sequence[Incoming]) -> None:
+    """Warn where navigation has pictures elsewhere than their own GPS, and of the usual cause."""
+    stated = np.array([[e.facts.latitude_deg, e.facts.longitude_deg] for e in entries], np.float64)
+    logged = np.array([[r.latitude_deg, r.longitude_deg] for r in records])
+    known = np.isfinite(stated + logged).all(axis=1)
+    if not known.any():
+        return
+    stated, logged = stated[known], logged[known]
+    apart_m = float(np.median(distances_m(logged, stated)))
+    sigma_m = max([_EXIF_SIGMA_M[0], *(r.sigma_horizontal_m for r in records)])
+    if apart_m > _FAR_M + _FAR_SIGMAS * sigma_m:
+        cause = "check the log, --time-zone and --clock-offset; is EXIF's GPS of an older fix?"
+        if np.median(distances_m(logged[:, ::-1], stated)) < apart_m / 2:
+            cause = "latitude and longitude exchanged?"
+        (north, east), (own_north, own_east) = logged[0], stated[0]
+        warn(
+            f"navigation and EXIF have {known.sum()} pictures {apart_m / 1e3:,.2f} km apart, the "
+            f"first at {north:.5f}, {east:.5f} and {own_north:.5f}, {own_east:.5f}: {cause}"
+        )
 
 
 def _times(

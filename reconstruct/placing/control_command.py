@@ -33,7 +33,7 @@ from alice_survey.core.artefacts import need_stage, write_csv
 from alice_survey.core.contents import as_line, one_line, ordinary_file, xml_root
 from alice_survey.core.errors import ReconstructionError, WorkspaceError, warn, why
 from alice_survey.core.executor import SERIAL, Executor
-from alice_survey.core.frames import Array, Datum
+from alice_survey.core.frames import Array, distances_m
 from alice_survey.core.manifest import ImageRecord, read_manifest
 from alice_survey.core.records import MappingRecord, RegistrationRecord, ScaleRecord
 from reconstruct.pictures.files import list_names, read_header, safe_name
@@ -437,13 +437,16 @@ def import_control(
     if there and not overwrite:
         raise WorkspaceError(f"{there[0]} is there: move it away, or give --overwrite")
     found = read_foreign(path)
-    placed = [point for point in found.points if not math.isnan(sum(point.place))]
+    placed = [point for point in found.points if not point.unknown]
     if heights == "ellipsoid" and not all(point.geodetic for point in placed):
         raise WorkspaceError(f"{path}: is of a local grid, which has no ellipsoid: --heights level")
     ends = {end for bar in found.lengths for end in bar.ends or ()}
     left = [p.name for p in found.points if p not in placed and p.name not in ends]
     if left:
-        warn(f"{path}: points without a whole place are left out: {_name_some(left)}")
+        warn(
+            f"{path}: {len(left)} points are left out, whose place is missing or stands for "
+            f"unknown: {_name_some(left)}"
+        )
     if not placed and not found.lengths:
         raise WorkspaceError(f"{path}: no point has a place")
     points = []
@@ -496,18 +499,12 @@ def _compare_places(
     seen = np.array([[r.latitude_deg, r.longitude_deg] for r in records if r.has_horizontal])
     if geodetic and len(seen):
         middle = np.median(seen, axis=0)
-        datum = Datum(*map(float, middle))
-
-        def metres(lat_lon: Array) -> Array:
-            on_earth = np.clip(lat_lon, [-90, -180], [90, 180])
-            whole = np.column_stack([on_earth, np.zeros(len(lat_lon))])
-            return np.asarray(np.linalg.norm(datum.ned_from_geodetic(whole)[:, :2], axis=1))
-
         at = np.array([[p.latitude_deg, p.longitude_deg] for p in geodetic])
-        far, extent_m = metres(at), float(metres(seen).max())
-        far_off = far > _FAR_M + _FAR_SHARE * extent_m
+        far = distances_m(at, middle)
+        near_m = _FAR_M + _FAR_SHARE * float(distances_m(seen, middle).max())
+        far_off = far > near_m
         if far_off.any():
-            swapped = far_off & (metres(at[:, ::-1]) < _FAR_M + _FAR_SHARE * extent_m)
+            swapped = far_off & (distances_m(at[:, ::-1], middle) < near_m)
             cause = "coordinates exchanged?" if swapped.any() else "check their system and its zone"
             warn(
                 f"{path}: {far_off.sum()} points lie {np.median(far[far_off]) / 1e3:,.1f} km from "
@@ -515,14 +512,22 @@ def _compare_places(
             )
     depths = np.array([p.depth_m for p in points if not math.isnan(p.depth_m)])
     taken = np.array([r.depth_m for r in records])
-    if not len(depths) or not np.isfinite(taken).any():
+    if not len(depths):
         return
-    depth, picture = float(np.median(depths)), float(np.nanmedian(taken))
+    depth, above = float(np.median(depths)), -_ABOVE_M
+    if not np.isfinite(taken).any():
+        if depth < above:
+            warn(
+                f"{path}: points lie {-depth:.1f} m above the level of depths, the sea: give "
+                "depths as negative heights; what do heights count from (--heights)?"
+            )
+        return
+    picture = float(np.nanmedian(taken))
     sigmas = np.array([r.sigma_depth_m for r in records])
     sigma = float(np.nanmax(sigmas)) if np.isfinite(sigmas).any() else 0.0
     off = abs(depth - picture) > _DEEP_M + _SIGMAS * sigma
     flipped = abs(depth + picture) < abs(depth - picture) / 2
-    if off or (flipped and depth < -_ABOVE_M < _ABOVE_M < picture):
+    if off or (flipped and depth < above < _ABOVE_M < picture):
         cause = "give depths as negative heights" if flipped else "what do heights count from?"
         warn(
             f"{path}: points are {depth:.1f} m deep, pictures {picture:.1f} m (sigma {sigma:.1f} "

@@ -38,7 +38,7 @@ import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -53,7 +53,7 @@ from alice_survey.core.artefacts import (
     replace_file,
     write_csv,
 )
-from alice_survey.core.contents import as_line
+from alice_survey.core.contents import as_line, is_nowhere, is_unknown
 from alice_survey.core.errors import WorkspaceError, warn, why
 from alice_survey.core.frames import Array, Datum
 from camera_calib.approximation.pinhole_warp import PinholeWarp
@@ -86,6 +86,12 @@ class KnownPoint:
         level = (self.latitude_deg, self.longitude_deg)
         vertical = self.depth_m if math.isnan(self.height_m) else self.height_m
         return (*(level if self.geodetic else (self.north_m, self.east_m)), vertical)
+
+    @property
+    def unknown(self) -> bool:
+        """Whether a number of the place is missing, or stands for unknown."""
+        nowhere = is_nowhere(self.latitude_deg, self.longitude_deg)
+        return nowhere or any(map(is_unknown, self.place))
 
     @property
     def geodetic(self) -> bool:
@@ -293,16 +299,23 @@ def _point(row: dict[str, str], name: str, use: Use, sigma: float) -> KnownPoint
         raise ValueError("sigma_vertical_m must be more than 0")
     if math.isnan(at["sigma_vertical_m"]):
         at["sigma_vertical_m"] = sigma
-    return KnownPoint(name=name, use=use, **at)
+    point = KnownPoint(name=name, use=use, **at)
+    if point.unknown:
+        raise ValueError(f"the place {point.place} of point {name} holds what stands for unknown")
+    return point
 
 
-_POLE_DEG = 90.0
+_POLE_DEG, _BEYOND_DEG = 90.0, 1.0
+"""A coordinate system is used so far beyond its own area of use, of neighbouring zones."""
 PlaceOf = Callable[[float, float], KnownPoint]
 """A nameless point from x (easting or longitude) and y in the coordinates of a file."""
 
 
+@lru_cache(maxsize=8)
 def coordinates(system: str) -> PlaceOf:
     """Coordinates of a file from the name of their system: what pyproj takes.
+
+    The first place outside of where the system is used is named in a warning.
 
     Raises:
         ValueError: it is no coordinate system; of a place, that it is beyond it.
@@ -322,17 +335,35 @@ def coordinates(system: str) -> PlaceOf:
     if crs.is_engineering:  # a local grid, metres
         return lambda x, y: KnownPoint(name="", north_m=y, east_m=x)
     to_wgs84 = Transformer.from_crs(crs.to_2d(), 4326, always_xy=True)
+    area, outside = crs.area_of_use, list[KnownPoint]()
 
     def place(x: float, y: float) -> KnownPoint:
+        if is_unknown(x) and is_unknown(y):
+            return KnownPoint(name="")
         try:
             longitude, latitude = to_wgs84.transform(x, y, errcheck=True)
         except ProjError:
             raise ValueError(f"{x}, {y} is not a place in {as_line(crs.name)}") from None
         if not abs(latitude) <= _POLE_DEG:
             raise ValueError(f"latitude {latitude:g}: are latitude and longitude exchanged?")
-        return KnownPoint(name="", latitude_deg=float(latitude), longitude_deg=float(longitude))
+        found = KnownPoint(name="", latitude_deg=float(latitude), longitude_deg=float(longitude))
+        if area is not None and not outside and _is_beyond(area, latitude, longitude):
+            outside.append(found)
+            warn(
+                f"{x:.10g}, {y:.10g} is latitude {latitude:.4f}, longitude {longitude:.4f}, "
+                f"outside of where {as_line(crs.name)} is used ({area.south:g} to {area.north:g}, "
+                f"{area.west:g} to {area.east:g}): check its zone, and whether it is north or south"
+            )
+        return found
 
     return place
+
+
+def _is_beyond(area: Any, latitude_deg: float, longitude_deg: float) -> bool:
+    """Whether a place lies outside of pyproj's area of use, which may cross the antimeridian."""
+    width = ((area.east - area.west) % 360.0 or 360.0) + 2.0 * _BEYOND_DEG
+    off = max(area.south - latitude_deg, latitude_deg - area.north)
+    return bool(off > _BEYOND_DEG or (longitude_deg - area.west + _BEYOND_DEG) % 360.0 > width)
 
 
 def read_number(text: str, name: str) -> float:

@@ -17,6 +17,7 @@ from alice_survey.core.manifest import ImageRecord, read_manifest, write_manifes
 from reconstruct.placing.control_command import import_control
 from reconstruct.placing.control_points import (
     Pick,
+    coordinates,
     read_control,
     read_picks,
     save_control,
@@ -332,6 +333,8 @@ def test_control_rows_are_replaced_by_kind_and_name(tmp_path: Path) -> None:
         ("-71.00001 46.00001 -6.0", (20, 30), ""),
         ("46 -71 -6.0", (20, 30), "exchanged"),
         ("-70 46 -6.0", (20, 30), "zone"),
+        ("-71 46 -9999", (20, 30), "unknown"),
+        ("0 0 -6.0", (20, 30), "unknown"),
         ("-71 46 5.5", (20, 30), "negative heights"),
         ("-71 46 -260", (20, 30), "count from"),
         ("-71 46 -6.0", (410, 230), "6.4"),
@@ -352,9 +355,37 @@ def test_control_is_compared_with_the_pictures(
         cv2.imwrite(str(workspace / "images" / name), np.zeros((48, 64), np.uint8))
     path = tmp_path / "gcp_list.txt"
     rows = [f"{place} {pixel[0]} {pixel[1]} {number}.png CHK-A" for number in (1, 2)]
-    path.write_text("\n".join(["EPSG:4326", *rows]))
+    path.write_text(
+        "\n".join(["EPSG:4326", *rows, *["-71 46 -6 20 30 1.png CHK-B"] * (said == "unknown")])
+    )
     warnings: list[str] = []
     with collected_by(lambda _, text: warnings.append(text)):
         import_control(workspace, path, sigma_m=0.1)
     assert [said in text for text in warnings] == [True] * bool(said)
-    assert [p.use for p in read_control(workspace / "control.csv").points] == ["check"]
+    points = read_control(workspace / "control.csv").points
+    assert [p.use for p in points] == ["check"]
+
+
+@pytest.mark.parametrize(
+    ("row", "outside"),
+    [("683000 3633500 -1", 0), ("683000 411645 -1", 1), ("900000 3633500 -1", 1)],
+)
+def test_places_outside_of_their_coordinate_system_are_named(
+    workspace: Path, tmp_path: Path, row: str, outside: int
+) -> None:
+    """A zone south of the equator with the northing of one north of it; three zones to the east."""
+    coordinates.cache_clear()
+    path = tmp_path / "gcp_list.txt"
+    path.write_text("\n".join(["WGS84 UTM 36S", *[f"{row} 1 2 DJI_1.jpg A{n}" for n in range(3)]]))
+    with keep_warnings() as warned:
+        import_control(workspace, path, sigma_m=0.1)
+    assert len(warned) == outside
+
+
+@pytest.mark.parametrize("place", ["-9999,5,1", "0,0,1", "60,5,-32768"])
+def test_control_without_a_place_is_refused(tmp_path: Path, place: str) -> None:
+    path = tmp_path / "control.csv"
+    header = "kind,name,use,latitude_deg,longitude_deg,depth_m,sigma_m"
+    path.write_text(f"{header}\npoint,A,control,{place},1\n")
+    with pytest.raises(WorkspaceError, match="line 2"):
+        read_control(path)
