@@ -186,7 +186,7 @@ def read_epochs(
         levers=-mounts.translation,
         measured_ned=_positions(readings, datum),
         ned_from_body=rotation_from_attitude(*np.deg2rad(np.nan_to_num(readings[:, 3:])).T),
-        sigma=_sigmas(first),
+        sigma=stated_sigmas(first),
         known=np.isfinite(shared),
         modes=np.zeros((len(chosen), 6, 0)) if modes is None else modes[chosen],
     )
@@ -214,7 +214,8 @@ def _positions(readings: Array, datum: Datum | None) -> Array:
     return datum.ned_from_geodetic(np.where(np.isfinite(places), places, middle))
 
 
-def _sigmas(rows: Sequence[ImageRecord]) -> Array:
+def stated_sigmas(rows: Sequence[ImageRecord]) -> Array:
+    """(N, 6) sigmas of the channels, metres and radians; usual ones where none are stated."""
     stated = np.array(
         [
             (r.sigma_horizontal_m, r.sigma_depth_m, r.sigma_attitude_deg, r.sigma_heading_deg)

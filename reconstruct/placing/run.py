@@ -39,6 +39,7 @@ from alice_survey.core.records import (
     CamerasRecord,
     DomingRecord,
     FarStation,
+    GeoreferenceRecord,
     JointRecord,
     MappingRecord,
     RegistrationRecord,
@@ -75,6 +76,7 @@ from reconstruct.placing.navigation import (
     USUAL_INSTALLATION,
     Installation,
     body_from_pinhole,
+    stated_sigmas,
 )
 from reconstruct.placing.place import Placing, find_place
 from reconstruct.placing.track import (
@@ -237,6 +239,8 @@ FAR_SIGMAS, FAR_M = 5.0, 0.5
 """A station is off navigation when it misses by more than both."""
 SCALE_BOUND = 1e-3
 """Relative error of lengths that a known rig must not exceed."""
+_MAX_LEFT_OUT = 0.25
+"""Share of stations whose readings may be left out before that is worth a warning."""
 _MIN_STATIONS = 5
 _ROUNDS = 20
 _MEDIAN_SIGMAS = 1.5382
@@ -462,6 +466,39 @@ def check_mapping(
     )
 
 
+def warn_of_navigation(
+    found: GeoreferenceRecord, records: Sequence[ImageRecord], *, controlled: bool
+) -> None:
+    """Warn where the placed model is many sigmas off navigation, and of the usual cause.
+
+    Args:
+        found: residuals of navigation, and what of it is left out.
+        records: pictures, with the sigmas that navigation states.
+        controlled: whether control took part.
+    """
+    cause = "are pictures of two zooms one camera, or is a sign, a clock or a sigma wrong?"
+    if controlled:
+        cause = "does control contradict it: by a sign, a zone, or coordinates exchanged?"
+    off = np.nan_to_num(
+        np.array([found.rms_north_m, found.rms_east_m, found.rms_depth_m], np.float64)
+    )
+    sigmas = np.median(stated_sigmas(records)[:, :3], axis=0)
+    said = [
+        f"the model is {off_m:.1f} m off navigation in {name} (rms; its sigma is {sigma:.2g} m)"
+        for name, off_m, sigma in zip(("north", "east", "depth"), off, sigmas, strict=True)
+        if off_m > max(FAR_SIGMAS * sigma, FAR_M)
+    ]
+    stations = len({record.station for record in records})
+    said += [
+        f"{count} of {stations} stations contradict the others in navigation's {group} readings, "
+        "which are left out"
+        for group, count in found.left_out.items()
+        if count > _MAX_LEFT_OUT * stations
+    ]
+    if said:
+        warn(f"{'; '.join(said)}: {cause}")
+
+
 def navigation_residuals(centres: Array, given: Array, sigmas: Array) -> tuple[Array, Array]:
     """Distances between places and where navigation has them, after a robust rigid alignment.
 
@@ -600,6 +637,8 @@ def run_sparse(
         write_track_geojson(folder / "track.geojson", rows, placed.frame, sigmas)
     if fit is not None:
         fit.record.write(folder / "georeference.json")
+        controlled = placed.control is not None
+        warn_of_navigation(fit.record, [of_name[name] for name in names], controlled=controlled)
     if placed.control is not None:
         score = placed.control.score(move, located=placed.located)
         warn_of_contradictions(score)

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from alice_survey.core.artefacts import read_json
-from alice_survey.core.errors import ImageError
+from alice_survey.core.errors import ImageError, keep_warnings
 from alice_survey.core.manifest import read_manifest
 from reconstruct.pictures.files import decode, exif_focal_px, inspect
 from reconstruct.pictures.importing import import_images
 from reconstruct.pictures.undistorted import read_colour
-from tests.reconstruct.pictures.dated import counts, reasons, rows_of, save
+from tests.reconstruct.pictures.dated import counts, reasons, rows_of, save, table, take
 
 DISPLAYED: dict[int, Callable[[np.ndarray], np.ndarray]] = {
     1: lambda a: a, 2: np.fliplr, 3: lambda a: np.rot90(a, 2), 4: np.flipud,
@@ -125,3 +125,18 @@ def test_folders_inside_are_taken_on_request(tmp_path: Path) -> None:
     import_images(tmp_path / "v", [source], recursive=True)
     records = rows_of(tmp_path / "v")
     assert [r.image for r in records if r.mask] == ["camera/G2.jpg"]
+
+
+@pytest.mark.parametrize(
+    ("place", "said"),
+    [("43,5", ""), ("5,43", "exchanged"), ("43.01,5", "1.11 km"), ("0,0", "no fix")],
+)
+def test_navigation_is_compared_with_exif(tmp_path: Path, place: str, said: str) -> None:
+    rows = [f"{name}.jpg,{place},3" for name in "ab"]
+    for i, name in enumerate("ab"):
+        take(tmp_path / "in" / f"{name}.jpg", i, place=0.0)
+    log = table(tmp_path / "n.csv", "image,lat,lon,depth", [row.split(",") for row in rows])
+    with keep_warnings() as warned:
+        import_images(tmp_path / "w", [tmp_path / "in"], navigation=log)
+    assert [said in text for text in warned] == [True] * bool(said)
+    assert rows_of(tmp_path / "w")[0].depth_m == 3.0

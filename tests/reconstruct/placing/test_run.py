@@ -2,6 +2,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,8 +17,8 @@ from alice_survey.core.artefacts import read_json, renew_outputs
 from alice_survey.core.config import ReconstructConfig, SurveyConfig
 from alice_survey.core.errors import AliceError, ReconstructionError
 from alice_survey.core.executor import SERIAL, Executor, local_executor
-from alice_survey.core.manifest import read_manifest, write_manifest
-from alice_survey.core.records import ScaleOfPairs
+from alice_survey.core.manifest import ImageRecord, read_manifest, write_manifest
+from alice_survey.core.records import GeoreferenceRecord, ScaleOfPairs
 from reconstruct.mapping.arrays import ground_pixel, observations
 from reconstruct.picking.lengths import scale_model
 from reconstruct.pictures.importing import import_images
@@ -305,6 +306,29 @@ def test_a_jump_is_reported_by_name_and_small_misses_are_not(
     assert f"{scene.records[rows[0]].image} (2." in capsys.readouterr().err
     stated = json.loads(json.dumps(found.to_json(), allow_nan=False))
     assert stated["far"][0]["station"] == station
+
+
+@pytest.mark.parametrize(
+    ("misfit", "said"),
+    [
+        ({}, []),
+        ({"rms_depth_m": 6.4, "rms_north_m": 4.0, "left_out": {"depth": 2}}, []),
+        ({"rms_depth_m": 328.4, "rms_north_m": 4.0}, ["328.4", "6 m"]),
+        ({"rms_east_m": 16.0}, ["16.0", "3 m"]),
+        ({"left_out": {"horizontal": 4}}, ["4 of 12"]),
+    ],
+)
+def test_a_model_many_sigmas_off_navigation_is_named(
+    misfit: dict[str, Any], said: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """GPS of EXIF: 3 m level, as where nothing is stated, and 6 m up and down."""
+    records = [
+        ImageRecord(image=f"{i}", camera="a", station=i, sigma_depth_m=6.0) for i in range(12)
+    ]
+    run.warn_of_navigation(GeoreferenceRecord(**misfit), records, controlled=False)
+    warned = capsys.readouterr().err
+    assert all(word in warned for word in said)
+    assert warned.count("\n") == bool(said)
 
 
 def test_a_rig_that_came_out_another_size_is_reported(capsys: pytest.CaptureFixture[str]) -> None:
