@@ -38,6 +38,8 @@ from reconstruct.mapping.self_calibration import SIMPLE, map_self_calibrated
 from reconstruct.mapping.working_range import (
     ANY_DISTANCE,
     find_distances,
+    first_stations,
+    refuse_exchanged,
     warn_of_warps,
     warp_record,
 )
@@ -166,6 +168,10 @@ def run_mapping(
         for i, record in enumerate(inputs.records)
     ]
     features = [picture.features for picture in pictures]
+    if inputs.rig is not None and (first := first_stations(inputs.records)):
+        list(executor.map(extract, [pictures[i] for i in first], label="features"))
+        few = [inputs.records[i] for i in first]
+        refuse_exchanged(few, [features[i] for i in first], inputs.rig, executor=executor)
     counts = list(executor.map(extract, pictures, label="features"))
     poor = [r.image for r, n in zip(inputs.records, counts, strict=True) if n < FEW_FEATURES]
     if poor:

@@ -1,8 +1,10 @@
 """How far the sea floor is from the cameras: it decides where the warp to a pinhole is exact."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -23,6 +25,9 @@ _STATIONS = 24
 """Stations looked at, spread evenly; fewer where cameras make more pairs than there are cameras."""
 _FEATURES = 3000
 _MIN_POINTS = 50
+_FIRST, _EXCHANGED = 6, 5.0
+"""Stations that show whether cameras are exchanged, and how many times more points are then in
+front of both cameras the other way round."""
 _MAX_GAP_PX = 2.0
 """Rays of a match pass each other by at most this many pixels."""
 _NEAR, _FAR = 0.75, 1.5
@@ -35,8 +40,51 @@ _MAX_CUT = 0.05
 """Share of a frame whose loss is worth a warning."""
 
 
-_StereoTask = tuple[tuple[Path, Path], tuple[Camera, Camera], RigidTransform]
-"""Features of two pictures of a station, their cameras, and `second_from_first`."""
+class _StereoTask(NamedTuple):
+    """Features of two pictures of a station, their cameras, and `second_from_first`."""
+
+    names: tuple[str, str]
+    files: tuple[Path, Path]
+    cameras: tuple[Camera, Camera]
+    second_from_first: RigidTransform
+
+
+def first_stations(records: Sequence[ImageRecord]) -> list[int]:
+    """Pictures of a few stations with several cameras, spread evenly, by number."""
+    of_station: dict[int, list[int]] = {}
+    for i, record in enumerate(records):
+        of_station.setdefault(record.station, []).append(i)
+    several = [pictures for _, pictures in sorted(of_station.items()) if len(pictures) > 1]
+    return [i for pictures in several[:: max(1, len(several) // _FIRST)] for i in pictures]
+
+
+def refuse_exchanged(
+    records: Sequence[ImageRecord], features: Sequence[Path], rig: Rig, *, executor: Executor
+) -> None:
+    """Refuse pictures whose matches lie in front of the rig with two of its cameras exchanged.
+
+    Args:
+        records: pictures, of a few stations.
+        features: file of features of every picture.
+        rig: calibrated cameras.
+        executor: where tasks run.
+
+    Raises:
+        ReconstructionError: two cameras seem exchanged.
+    """
+    tasks = _stereo_tasks(records, features, rig)
+    ways = [*tasks, *(task._replace(files=task.files[::-1]) for task in tasks)]
+    points: Counter[tuple[tuple[str, str], bool]] = Counter()
+    for i, depths in enumerate(executor.map(stereo_depths, ways, label="order of cameras")):
+        points[ways[i].names, i < len(tasks)] += len(depths) // 2
+    for pair in dict.fromkeys(task.names for task in tasks):
+        given, other = points[pair, True], points[pair, False]
+        if other >= _MIN_POINTS and other > _EXCHANGED * given:
+            raise ReconstructionError(
+                f"{' and '.join(pair)} seem exchanged: {other} points of their first pictures lie "
+                f"in front of the rig that way, {given} as they are: import the pictures again "
+                "with the two the other way round, or check the rig"
+            )
 
 
 def find_distances(
@@ -108,7 +156,7 @@ def warn_of_warps(warps: Mapping[str, PinholeWarp], distances: RangeRecord) -> N
 
 def stereo_depths(task: _StereoTask) -> Array:
     """Depths of the matches of two pictures along the axis of either camera, exactly refracted."""
-    files, (first, second), second_from_first = task
+    _, files, (first, second), second_from_first = task
     a, b = map(load_features, files)
     some, other = a.descriptors[:_FEATURES], b.descriptors[:_FEATURES]
     matches = match_descriptors(some, other, SIFT_RATIO)
@@ -161,7 +209,8 @@ def _stereo_tasks(
     step = max(1, sum(map(len, together)) // (_STATIONS * max(1, cameras - 1)))
     poses = rig.cam_from_rig
     return [
-        (
+        _StereoTask(
+            (first, second),
             (features[i], features[j]),
             (rig.cameras[first], rig.cameras[second]),
             poses[second] * poses[first].inv(),

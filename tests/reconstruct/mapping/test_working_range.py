@@ -8,10 +8,16 @@ import pytest
 from alice_survey.core.errors import ReconstructionError
 from alice_survey.core.executor import SERIAL
 from camera_calib.rig import Rig
-from reconstruct.mapping.working_range import find_distances, ray_passes
+from reconstruct.mapping.working_range import (
+    find_distances,
+    first_stations,
+    ray_passes,
+    refuse_exchanged,
+)
 from reconstruct.matching.features import Features, save_features
 from tests.reconstruct.rig_survey import four_cameras
 from tests.reconstruct.scenes import ALTITUDE_M, Scene, make_scene
+from tests.refusals import refused
 
 
 def features_of(scene: Scene, folder: Path) -> list[Path]:
@@ -45,6 +51,23 @@ def test_stereo_matches_give_the_distance(tmp_path: Path, rig: Rig | None) -> No
     assert found.source == "stereo"
     assert found.near_m == pytest.approx(near, abs=0.02)
     assert found.far_m == pytest.approx(far, abs=0.02)
+
+
+@pytest.mark.parametrize("rig", [None, four_cameras()], ids=["stereo", "four cameras"])
+def test_cameras_that_are_exchanged_are_refused(tmp_path: Path, rig: Rig | None) -> None:
+    """By a few stations, before others have features."""
+    scene = make_scene(lines=1, stations=8, points=2500, noise_px=0.2, rig=rig)
+    paths = features_of(scene, tmp_path)
+    first = first_stations(scene.records)
+    assert len({scene.records[i].station for i in first}) >= 6
+    files = [paths[i] for i in first]
+    records = [scene.records[i] for i in first]
+    refuse_exchanged(records, files, scene.rig, executor=SERIAL)
+    if rig is None:
+        other = {"left": "right", "right": "left"}
+        records = [replace(record, camera=other[record.camera]) for record in records]
+        with refused(ReconstructionError, "left", "right"):
+            refuse_exchanged(records, files, scene.rig, executor=SERIAL)
 
 
 def test_the_altitude_stands_in(tmp_path: Path) -> None:
