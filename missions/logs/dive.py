@@ -154,7 +154,7 @@ def clean_signal(source: str, time_s: Array, values: Array, lost: Counter[str]) 
     if not good.all():
         lost |= Counter({f"{source}: the time is not a number, or after 2200": int((~good).sum())})
     time_s, values = time_s[good], values[good]
-    unknown = where_unknown(values)
+    unknown = where_unknown(values) | where_unknown(-values)  # of a height, as a depth
     if stated := int((unknown & np.isfinite(values)).sum()):
         lost |= Counter({f"{source}: numbers that stand for unknown": stated})
     values = np.where(unknown, np.nan, values)

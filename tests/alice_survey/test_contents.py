@@ -6,9 +6,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.linalg import cho_factor
+from scipy.sparse import csc_array
+from scipy.sparse.linalg import splu
 
-from alice_survey.core.contents import as_line, one_line, read_arrays, taken_from
-from alice_survey.core.errors import PlanError, WorkspaceError
+from alice_survey.core.contents import (
+    UNKNOWN,
+    as_line,
+    is_unknown,
+    one_line,
+    read_arrays,
+    taken_from,
+    where_unknown,
+)
+from alice_survey.core.errors import PlanError, WorkspaceError, known_fault
 from tests.refusals import refused
 
 FILE = Path("frame.json")
@@ -29,6 +40,27 @@ def test_a_missing_value_names_the_file(take: Callable[[Any], object]) -> None:
 def test_known_faults_pass() -> None:
     with pytest.raises(PlanError), taken_from(FILE):
         raise PlanError
+
+
+@pytest.mark.parametrize(
+    "solve",
+    [
+        lambda a: splu(csc_array(a)), lambda a: np.linalg.solve(a, a[0]), np.linalg.cholesky,
+        cho_factor,
+    ],
+)  # fmt: skip
+def test_a_singular_factor_is_a_known_fault(solve: Callable[[Any], object]) -> None:
+    with pytest.raises(Exception, match=r"(?i)singular|definite|minor") as raised:
+        solve(np.zeros((3, 3)))
+    line = known_fault(raised.value)
+    assert line is not None and "\n" not in line
+    assert known_fault(ValueError("operands could not be broadcast")) is None
+
+
+def test_unknown_numbers_are_one_list() -> None:
+    values = np.array([*UNKNOWN, np.nan, np.inf, -3.4e38, 0.0, -9998.0, 1e5])
+    np.testing.assert_array_equal(where_unknown(values), [*map(is_unknown, values.tolist())])
+    assert where_unknown(values).sum() == len(UNKNOWN) + 3
 
 
 def test_text_of_others_is_shown_on_one_line() -> None:

@@ -116,7 +116,8 @@ def test_tide_by_hand(tmp_path: Path) -> None:
 
     # Rising by 0.6 m in 60 s from 12:00:00 UTC: at the first position, 12:00:01, it is 0.51 m.
     tides = tmp_path / "tides.csv"
-    tides.write_text("time_utc,height_m\n2024-05-01T12:00:00Z,0.5\n2024-05-01T14:01:00+02:00,1.1\n")
+    rows = ["12:00:00Z,0.5", "12:00:01Z,-9999", "12:00:02Z,nan", "14:01:00+02:00,1.1"]
+    tides.write_text("\n".join(["time_utc,height_m", *(f"2024-05-01T{row}" for row in rows)]))
     data = imported(log, tide=str(tides))
     assert data["depths_from"] == "level of the tide"
     depth = numbers(tmp_path, "depth_m")
@@ -368,6 +369,18 @@ def test_telemetry_without_a_position(tmp_path: Path) -> None:
     data = imported(log)
     assert data["left_out"] == {"GLOBAL_POSITION_INT: the position is 0, 0: no fix": len(zero)}
     np.testing.assert_allclose(numbers(tmp_path, "depth_m"), 1.0)
+
+
+@pytest.mark.parametrize("height_m", [-9999.0, -32768.0, 3.4e38])
+def test_what_stands_for_unknown_in_a_log_is_no_depth(tmp_path: Path, height_m: float) -> None:
+    messages = [
+        (*m[:5], height_m, m[6]) if m[0] == "POS" and i % 4 else m
+        for i, m in enumerate(dive_messages())
+    ]
+    altered = sum(m[0] == "POS" and m[5] == height_m for m in messages)
+    left_out = imported(bin_log(tmp_path, messages))["left_out"]
+    assert altered and sum(left_out.values()) == altered
+    assert np.nanmax(numbers(tmp_path, "depth_m")) < 10.0
 
 
 @pytest.mark.parametrize(
