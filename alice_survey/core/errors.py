@@ -185,8 +185,6 @@ _NO_MEMORY = (
     "failed to map segment",
 )  # fmt: skip
 """Messages, in lower case, of libraries with error types of their own."""
-_UNDETERMINED = ("singular", "not positive definite")
-"""The same of solvers of linear equations: SuperLU, LAPACK, CHOLMOD, Ceres."""
 
 
 def memory_shortage(path: Path) -> AliceError:
@@ -201,11 +199,9 @@ def known_fault(error: BaseException) -> str | None:
     said = str(error).lower()
     if isinstance(error, MemoryError) or any(words in said for words in _NO_MEMORY):
         return f"memory ran out{_FEWER}"
-    if any(words in said for words in _UNDETERMINED):
-        return (
-            f"what was given leaves the equations without one solution ({said}): are pictures of "
-            "left and right exchanged, or too few linked to the others?"
-        )
+    if "singular" in said or "positive definite" in said:  # SuperLU, LAPACK, CHOLMOD
+        cause = "are left and right exchanged, or too few pictures linked to the others?"
+        return f"what was given leaves the equations without one solution ({said}): {cause}"
     if isinstance(error, OSError):  # a full disk, a folder where a file should be, no permission
         where = error.filename2 or error.filename
         text = error.strerror or str(error)

@@ -64,8 +64,12 @@ _DOWN = 25
 """ROTATION_PITCH_270: a range finder that looks down."""
 _GOOD = 4
 """RangeFinder status: in range."""
-_MIN_QUALITY = 90
-"""Per cent of signal quality below which ArduSub ignores a range itself (its RNGFND_SQ_MIN)."""
+_QUALITY = {
+    "RFND": ("Quality", -1, 90), "DISTANCE_SENSOR": ("signal_quality", 0, 90),
+    "distance_sensor": ("signal_quality", -1, 1),
+}  # fmt: skip
+"""By message: its field of a quality in per cent, what stands for unknown (a 0 alone: where others
+are stated it is one, too), and the least of use: ArduSub's RNGFND_SQ_MIN, and PX4's."""
 _SUBMARINE = 12
 _NO_VEHICLES = {0, 5, 6, 18, 26, 27, 30}
 """MAV_TYPE (mavlink.io/en/messages/minimal.html) of generic parts, antenna trackers, ground
@@ -123,9 +127,6 @@ class Source:
     """What to know of it when it is used."""
     sigma: Reader | None = None
     """What the vehicle states of its error, where it does."""
-    quality: tuple[str, float, float] = ("", -1, 0)
-    """Field of a quality in per cent, what stands for unknown (all others from 0 on are stated, and
-    this where any is), and the least of use."""
 
 
 _SIGMA_COLUMNS = {"navigation": "sigma_horizontal_m", "depth": "sigma_depth_m"}
@@ -199,7 +200,7 @@ def _signal(
         message = source.message
         if message not in log.tables or (name and message != name):
             continue
-        field, unknown, minimum = source.quality
+        field, unknown, minimum = _QUALITY.get(message, ("", -1, 0))
         try:
             table, others = _one_instance(message, log.tables[message], instance)
             quality = table.get(field, np.full(len(table["time_s"]), -1.0))
@@ -334,9 +335,7 @@ _BIN: Mapping[str, tuple[Source, ...]] = {
     "attitude": tuple(
         Source(message, take("Roll", "Pitch", "Yaw")) for message in ("ATT", "XKF1", "NKF1", "AHR2")
     ),
-    "altitude": (
-        Source("RFND", take("Dist", where=_sees_down), quality=("Quality", -1, _MIN_QUALITY)),
-    ),
+    "altitude": (Source("RFND", take("Dist", where=_sees_down)),),
     "velocity": tuple(Source(message, take("VN", "VE", "VD")) for message in ("XKF1", "NKF1")),
     "rates": (Source("RATE", take("R", "P", "Y", scale=float(np.deg2rad(1.0)))),),
     "pwm": (Source("RCOU", take(*(f"C{i}" for i in range(1, 9)))),),
@@ -353,11 +352,7 @@ _TLOG: Mapping[str, tuple[Source, ...]] = {
     ),
     "attitude": (Source("ATTITUDE", take("roll", "pitch", "yaw", scale=_DEGREES)),),
     "altitude": (
-        Source(
-            "DISTANCE_SENSOR",
-            take("current_distance", scale=1e-2, where=_hears_bottom),
-            quality=("signal_quality", 0, _MIN_QUALITY),
-        ),
+        Source("DISTANCE_SENSOR", take("current_distance", scale=1e-2, where=_hears_bottom)),
         Source("RANGEFINDER", take("distance", where=lambda t: t["distance"] != 0.0)),
     ),
     "velocity": (Source("GLOBAL_POSITION_INT", take("vx", "vy", "vz", scale=1e-2)),),
@@ -388,13 +383,7 @@ _ULG: Mapping[str, tuple[Source, ...]] = {
         ),
     ),
     "attitude": (Source("vehicle_attitude", _px4_attitude),),
-    "altitude": (
-        Source(
-            "distance_sensor",
-            take("current_distance", where=_hears_bottom),
-            quality=("signal_quality", -1, 1),
-        ),
-    ),
+    "altitude": (Source("distance_sensor", take("current_distance", where=_hears_bottom)),),
     "velocity": (Source(_LOCAL, take("vx", "vy", "vz", where=_velocity_holds)),),
     "rates": (Source("vehicle_angular_velocity", take(*(f"xyz[{i}]" for i in range(3)))),),
     "pwm": (Source("actuator_outputs", take(*(f"output[{i}]" for i in range(8)))),),

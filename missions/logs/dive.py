@@ -199,11 +199,9 @@ def usable_positions(position: Signal | None, lost: Counter[str]) -> Signal | No
     """The rows of a position signal that can be a place; what is left out is counted."""
     if position is None:
         return None
-    latitude, longitude = position.values.T
-    with np.errstate(invalid="ignore"):
-        known = np.isfinite(latitude) & np.isfinite(longitude)
-        inside = (np.abs(latitude) <= 90.0) & (np.abs(longitude) <= 180.0)
-    nowhere = known & (latitude == 0) & (longitude == 0)  # as `is_nowhere` says of one
+    known = np.isfinite(position.values).all(axis=1)
+    inside = (np.abs(position.values) <= [90.0, 180.0]).all(axis=1)
+    nowhere = (position.values == 0).all(axis=1)  # as `is_nowhere` says of one
     for reason, rows in (
         ("the position is not a number", ~known),
         ("the position is beyond the range of latitude and longitude", known & ~inside),

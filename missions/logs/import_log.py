@@ -172,10 +172,6 @@ def read_dive(path: Path, options: ImportOptions) -> LoggedDive:
     Raises:
         NavigationError: it is missing, of no known format, or cannot be used.
     """
-    if not path.exists():
-        raise NavigationError(f"{path}: no such file or folder")
-    if not (path.is_file() or path.is_dir()):  # a pipe would be waited on for ever
-        raise NavigationError(f"{path}: is not a file")
     chosen = _roles(options.topics)
     suffix = path.suffix.lower()
     datum = None if options.datum_deg is None else Datum(*options.datum_deg)
@@ -426,27 +422,20 @@ def read_tide(text: str, *, dated: bool) -> float | Signal:
             f"--tide is neither metres nor a CSV of tides: {error}{undated}"
         ) from None
     table: list[tuple[float, float]] = []
-    unknown: list[int] = []
     for line, row in rows:
         cell, height = row[column], row["height_m"]
         try:
             time_s = utc_date(cell).timestamp() if dated else parse_number(cell)
-            if is_unknown(metres := parse_number(height)):
-                unknown.append(line)
-                continue
-            table.append((time_s, metres))
+            table.append((time_s, parse_number(height)))
         except ValueError:
             raise NavigationError(
                 f"{text} line {line}: {cell!r}, {height!r}: not a time and a height"
             ) from None
-        if not np.isfinite(table[-1]).all() or (table[:-1] and time_s <= table[-2][0]):
-            raise NavigationError(
-                f"{text} line {line}: needs finite heights at times that increase"
-            )
+        before_s = table[-2][0] if table[:-1] else -math.inf
+        if is_unknown(table[-1][1]) or not before_s < time_s < math.inf:
+            raise NavigationError(f"{text} line {line}: needs heights at times that increase")
     if not table:
         raise NavigationError(f"{text}: holds no tides")
-    if unknown:
-        warn(f"{text}: {len(unknown)} heights from line {unknown[0]} on stand for unknown")
     times, heights = np.array(table).T
     return Signal(source=text, time_s=times, values=heights[:, None])
 

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from alice_survey.core.artefacts import need_stage, refuse_links
-from alice_survey.core.contents import one_line
+from alice_survey.core.contents import one_line, where_unknown
 from alice_survey.core.errors import ReconstructionError, WorkspaceError, why
 from alice_survey.core.executor import run_apart
 from alice_survey.core.frames import Array, Datum
@@ -146,7 +146,7 @@ def _read_tiff(path: Path) -> tuple[Array, str | None]:
         shape = (-(-source.height // step), -(-source.width // step))
         band = source.read(1, out_shape=shape, masked=True)
         height = band.astype(np.float64).filled(np.nan)
-        rows, columns = np.nonzero(np.isfinite(height))
+        rows, columns = np.nonzero(~where_unknown(height))
         x = (columns + 0.5) * source.width / shape[1]
         y = (rows + 0.5) * source.height / shape[0]
         east = source.transform.c + x * source.transform.a + y * source.transform.b

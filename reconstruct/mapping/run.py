@@ -168,7 +168,8 @@ def run_mapping(
         for i, record in enumerate(inputs.records)
     ]
     features = [picture.features for picture in pictures]
-    if inputs.rig is not None and (first := first_stations(inputs.records)):
+    if inputs.rig is not None:
+        first = first_stations(inputs.records)
         list(executor.map(extract, [pictures[i] for i in first], label="features"))
         few = [inputs.records[i] for i in first]
         refuse_exchanged(few, [features[i] for i in first], inputs.rig, executor=executor)

@@ -4,7 +4,6 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -40,22 +39,15 @@ _MAX_CUT = 0.05
 """Share of a frame whose loss is worth a warning."""
 
 
-class _StereoTask(NamedTuple):
-    """Features of two pictures of a station, their cameras, and `second_from_first`."""
-
-    names: tuple[str, str]
-    files: tuple[Path, Path]
-    cameras: tuple[Camera, Camera]
-    second_from_first: RigidTransform
+_StereoTask = tuple[tuple[Path, Path], tuple[Camera, Camera], RigidTransform, tuple[str, str]]
+"""Features of two pictures of a station, their cameras, `second_from_first`, and their names."""
 
 
 def first_stations(records: Sequence[ImageRecord]) -> list[int]:
-    """Pictures of a few stations with several cameras, spread evenly, by number."""
-    of_station: dict[int, list[int]] = {}
-    for i, record in enumerate(records):
-        of_station.setdefault(record.station, []).append(i)
-    several = [pictures for _, pictures in sorted(of_station.items()) if len(pictures) > 1]
-    return [i for pictures in several[:: max(1, len(several) // _FIRST)] for i in pictures]
+    """Pictures of a few stations, spread evenly, by number."""
+    stations = sorted({record.station for record in records})
+    some = stations[:: max(1, len(stations) // _FIRST)]
+    return [i for i, record in enumerate(records) if record.station in some]
 
 
 def refuse_exchanged(
@@ -73,17 +65,16 @@ def refuse_exchanged(
         ReconstructionError: two cameras seem exchanged.
     """
     tasks = _stereo_tasks(records, features, rig)
-    ways = [*tasks, *(task._replace(files=task.files[::-1]) for task in tasks)]
+    ways = [*tasks, *((files[::-1], both, pose, pair) for files, both, pose, pair in tasks)]
     points: Counter[tuple[tuple[str, str], bool]] = Counter()
     for i, depths in enumerate(executor.map(stereo_depths, ways, label="order of cameras")):
-        points[ways[i].names, i < len(tasks)] += len(depths) // 2
-    for pair in dict.fromkeys(task.names for task in tasks):
+        points[ways[i][-1], i < len(tasks)] += len(depths) // 2
+    for pair in dict.fromkeys(pair for *_, pair in tasks):
         given, other = points[pair, True], points[pair, False]
         if other >= _MIN_POINTS and other > _EXCHANGED * given:
             raise ReconstructionError(
-                f"{' and '.join(pair)} seem exchanged: {other} points of their first pictures lie "
-                f"in front of the rig that way, {given} as they are: import the pictures again "
-                "with the two the other way round, or check the rig"
+                f"{' and '.join(pair)} seem exchanged: {other} points lie in front of the rig that "
+                f"way, {given} as they are: import the pictures the other way round"
             )
 
 
@@ -156,7 +147,7 @@ def warn_of_warps(warps: Mapping[str, PinholeWarp], distances: RangeRecord) -> N
 
 def stereo_depths(task: _StereoTask) -> Array:
     """Depths of the matches of two pictures along the axis of either camera, exactly refracted."""
-    _, files, (first, second), second_from_first = task
+    files, (first, second), second_from_first, _ = task
     a, b = map(load_features, files)
     some, other = a.descriptors[:_FEATURES], b.descriptors[:_FEATURES]
     matches = match_descriptors(some, other, SIFT_RATIO)
@@ -209,11 +200,11 @@ def _stereo_tasks(
     step = max(1, sum(map(len, together)) // (_STATIONS * max(1, cameras - 1)))
     poses = rig.cam_from_rig
     return [
-        _StereoTask(
-            (first, second),
+        (
             (features[i], features[j]),
             (rig.cameras[first], rig.cameras[second]),
             poses[second] * poses[first].inv(),
+            (first, second),
         )
         for pairs in together[::step]
         for (first, i), (second, j) in pairs

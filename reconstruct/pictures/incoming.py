@@ -747,22 +747,21 @@ _FAR_M, _FAR_SIGMAS = 100.0, 5.0
 
 def _compare_with_exif(records: Sequence[ImageRecord], entries: Sequence[Incoming]) -> None:
     """Warn where navigation has pictures elsewhere than their own GPS, and of the usual cause."""
-    stated = np.array([[e.facts.latitude_deg, e.facts.longitude_deg] for e in entries], np.float64)
+    facts = [entry.facts for entry in entries]
+    stated = np.array([[f.latitude_deg, f.longitude_deg] for f in facts], np.float64)
     logged = np.array([[r.latitude_deg, r.longitude_deg] for r in records])
-    known = np.isfinite(stated + logged).all(axis=1)
-    if not known.any():
+    apart_m = distances_m(logged, stated)
+    if not (count := int(np.isfinite(apart_m).sum())):
         return
-    stated, logged = stated[known], logged[known]
-    apart_m = float(np.median(distances_m(logged, stated)))
+    apart, turned = np.nanmedian([apart_m, distances_m(logged[:, ::-1], stated)], axis=1)
     sigma_m = max([_EXIF_SIGMA_M[0], *(r.sigma_horizontal_m for r in records)])
-    if apart_m > _FAR_M + _FAR_SIGMAS * sigma_m:
+    if apart > _FAR_M + _FAR_SIGMAS * sigma_m:
         cause = "check the log, --time-zone and --clock-offset; is EXIF's GPS of an older fix?"
-        if np.median(distances_m(logged[:, ::-1], stated)) < apart_m / 2:
-            cause = "latitude and longitude exchanged?"
-        (north, east), (own_north, own_east) = logged[0], stated[0]
+        cause = "latitude and longitude exchanged?" if turned < apart / 2 else cause
+        own, gps = np.nanmedian([logged, stated], axis=1).round(5).tolist()
         warn(
-            f"navigation and EXIF have {known.sum()} pictures {apart_m / 1e3:,.2f} km apart, the "
-            f"first at {north:.5f}, {east:.5f} and {own_north:.5f}, {own_east:.5f}: {cause}"
+            f"navigation and EXIF have {count} pictures {apart / 1e3:,.2f} km apart, around {own} "
+            f"and {gps}: {cause}"
         )
 
 

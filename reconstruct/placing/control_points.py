@@ -36,7 +36,7 @@ import io
 import math
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -53,7 +53,7 @@ from alice_survey.core.artefacts import (
     replace_file,
     write_csv,
 )
-from alice_survey.core.contents import as_line, is_nowhere, is_unknown
+from alice_survey.core.contents import as_line, is_nowhere, is_unknown, parse_number
 from alice_survey.core.errors import WorkspaceError, warn, why
 from alice_survey.core.frames import Array, Datum
 from camera_calib.approximation.pinhole_warp import PinholeWarp
@@ -338,8 +338,6 @@ def coordinates(system: str) -> PlaceOf:
     area, outside = crs.area_of_use, list[KnownPoint]()
 
     def place(x: float, y: float) -> KnownPoint:
-        if is_unknown(x) and is_unknown(y):
-            return KnownPoint(name="")
         try:
             longitude, latitude = to_wgs84.transform(x, y, errcheck=True)
         except ProjError:
@@ -372,13 +370,12 @@ def read_number(text: str, name: str) -> float:
     Raises:
         ValueError: it is none.
     """
-    try:
-        value = float(text) if text.strip() else math.nan
-    except ValueError:
-        value = math.inf
-    if math.isinf(value) or (text.strip() and math.isnan(value)):
-        raise ValueError(f"{as_line(name)} is {as_line(text)!r}, not a number")
-    return value
+    if not text.strip():
+        return math.nan
+    with suppress(ValueError):
+        if math.isfinite(value := parse_number(text)):
+            return value
+    raise ValueError(f"{as_line(name)} is {as_line(text)!r}, not a number")
 
 
 def read_positive(text: str, name: str) -> float:

@@ -476,27 +476,23 @@ def warn_of_navigation(
         records: pictures, with the sigmas that navigation states.
         controlled: whether control took part.
     """
-    cause = "are pictures of two zooms one camera, or is a sign, a clock or a sigma wrong?"
-    if controlled:
-        cause = "does control contradict it: by a sign, a zone, or coordinates exchanged?"
-    off = np.nan_to_num(
-        np.array([found.rms_north_m, found.rms_east_m, found.rms_depth_m], np.float64)
-    )
     sigmas = np.median(stated_sigmas(records)[:, :3], axis=0)
     said = [
-        f"the model is {off_m:.1f} m off navigation in {name} (rms; its sigma is {sigma:.2g} m)"
-        for name, off_m, sigma in zip(("north", "east", "depth"), off, sigmas, strict=True)
-        if off_m > max(FAR_SIGMAS * sigma, FAR_M)
+        f"{off_m:.1f} m in {name}, of sigma {sigma:.2g} m"
+        for name, sigma in zip(("north", "east", "depth"), sigmas, strict=True)
+        if (off_m := getattr(found, f"rms_{name}_m") or 0.0) > max(FAR_SIGMAS * sigma, FAR_M)
     ]
     stations = len({record.station for record in records})
     said += [
-        f"{count} of {stations} stations contradict the others in navigation's {group} readings, "
-        "which are left out"
-        for group, count in found.left_out.items()
+        f"beyond use in {name} of {count} of {stations} stations"
+        for name, count in found.left_out.items()
         if count > _MAX_LEFT_OUT * stations
     ]
+    cause = "is a sign, a clock or a sigma wrong, or are pictures of two zooms one camera?"
+    if controlled:
+        cause = "does control contradict it by a sign, a zone or coordinates exchanged?"
     if said:
-        warn(f"{'; '.join(said)}: {cause}")
+        warn(f"the model is off navigation by (rms) {'; '.join(said)}: {cause}")
 
 
 def navigation_residuals(centres: Array, given: Array, sigmas: Array) -> tuple[Array, Array]:

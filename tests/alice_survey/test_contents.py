@@ -10,15 +10,7 @@ from scipy.linalg import cho_factor
 from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
-from alice_survey.core.contents import (
-    UNKNOWN,
-    as_line,
-    is_unknown,
-    one_line,
-    read_arrays,
-    taken_from,
-    where_unknown,
-)
+from alice_survey.core.contents import as_line, one_line, read_arrays, taken_from
 from alice_survey.core.errors import PlanError, WorkspaceError, known_fault
 from tests.refusals import refused
 
@@ -55,12 +47,6 @@ def test_a_singular_factor_is_a_known_fault(solve: Callable[[Any], object]) -> N
     line = known_fault(raised.value)
     assert line is not None and "\n" not in line
     assert known_fault(ValueError("operands could not be broadcast")) is None
-
-
-def test_unknown_numbers_are_one_list() -> None:
-    values = np.array([*UNKNOWN, np.nan, np.inf, -3.4e38, 0.0, -9998.0, 1e5])
-    np.testing.assert_array_equal(where_unknown(values), [*map(is_unknown, values.tolist())])
-    assert where_unknown(values).sum() == len(UNKNOWN) + 3
 
 
 def test_text_of_others_is_shown_on_one_line() -> None:

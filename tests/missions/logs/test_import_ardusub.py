@@ -116,8 +116,7 @@ def test_tide_by_hand(tmp_path: Path) -> None:
 
     # Rising by 0.6 m in 60 s from 12:00:00 UTC: at the first position, 12:00:01, it is 0.51 m.
     tides = tmp_path / "tides.csv"
-    rows = ["12:00:00Z,0.5", "12:00:01Z,-9999", "12:00:02Z,nan", "14:01:00+02:00,1.1"]
-    tides.write_text("\n".join(["time_utc,height_m", *(f"2024-05-01T{row}" for row in rows)]))
+    tides.write_text("time_utc,height_m\n2024-05-01T12:00:00Z,0.5\n2024-05-01T14:01:00+02:00,1.1\n")
     data = imported(log, tide=str(tides))
     assert data["depths_from"] == "level of the tide"
     depth = numbers(tmp_path, "depth_m")
@@ -126,6 +125,9 @@ def test_tide_by_hand(tmp_path: Path) -> None:
 
     tides.write_text("time_utc,height_m\n2024-05-01T12:00:02Z,0.5\n2024-05-01T13:00:00Z,1.1\n")
     with pytest.raises(NavigationError, match="2024-05-01 12:00:01"):
+        imported(log, tide=str(tides))
+    tides.write_text("time_utc,height_m\n2024-05-01T12:00:00Z,-9999\n2024-05-01T13:00:00Z,1\n")
+    with pytest.raises(NavigationError, match="line 2"):
         imported(log, tide=str(tides))
     tides.write_text("time_s,height_m\n0,0.5\n")
     with pytest.raises(NavigationError, match="time_utc"):
