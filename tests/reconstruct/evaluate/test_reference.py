@@ -150,11 +150,14 @@ def test_a_cloud_in_utm_comes_back_to_local_metres(tmp_path: Path, kind: str) ->
     np.testing.assert_allclose(found, points, atol=3e-4)
 
 
-def test_cells_of_an_elevation_model_are_points_at_their_middles(tmp_path: Path) -> None:
+@pytest.mark.parametrize("nodata", [-9999, None])
+def test_cells_of_an_elevation_model_are_points_at_their_middles(
+    tmp_path: Path, nodata: int | None
+) -> None:
     corner = tuple(utm(np.array([[-5.0, 5.0, 0.0]]))[0, :2])
     height = np.arange(400, dtype=np.float32).reshape(20, 20) / 100
     height[3, 4] = -9999
-    path = write_raster(tmp_path / "dem.tif", height[None], 0.5, corner, crs=UTM, nodata=-9999)
+    path = write_raster(tmp_path / "dem.tif", height[None], 0.5, corner, crs=UTM, nodata=nodata)
     found, placed = read_reference(path, DATUM)
     assert placed
     assert len(found) == 399
