@@ -28,8 +28,6 @@ from camera_calib.formats.camera_files import (
     record_of,
     write_records,
 )
-from camera_calib.ports.dome import DomePort
-from camera_calib.ports.flat import FlatPort
 from camera_calib.rig import Rig
 
 CAMERA_FILES = ("cameras.bin", "cameras.txt")
@@ -251,34 +249,14 @@ def _pose_values(pose: RigidTransform) -> dict[str, Any]:
     return {"turn": turn.tolist(), "shift": pose.translation.tolist()}
 
 
-def _has_ports(path: Path) -> bool | None:
+def has_ports(path: Path) -> bool | None:
     """Whether a camera of a file or folder of these formats has a port; None for any other."""
     if path.is_dir():
         names = (*CAMERA_FILES, RIG_CONFIG)
         found = [path / name for name in names if os.path.lexists(path / name)]
-        return _has_ports(found[0]) if found else None
+        return has_ports(found[0]) if found else None
     suffix = path.suffix.lower()
     if suffix in (".txt", ".bin"):
         return any(record.refraction for record in read_records(path))
     listed = suffix == ".json" and fields.read_text(path).lstrip().startswith("[")
     return False if listed else None
-
-
-FORMAT = rigs.CalibrationFormat(
-    name="colmap",
-    title="COLMAP model and rig_config.json",
-    holds=frozenset({rigs.K3, rigs.RATIONAL}),
-    owns=lambda path: _has_ports(path) is False,
-    read=read_colmap,
-    write=write_colmap,
-    files=model_files,
-)
-REFRACTIVE = rigs.CalibrationFormat(
-    name="refractive",
-    title="Refractive COLMAP cameras with FLATPORT or DOMEPORT",
-    holds=FORMAT.holds | {FlatPort.shape, DomePort.shape},
-    owns=lambda path: _has_ports(path) is True,
-    read=read_colmap,
-    write=write_refractive,
-    files=model_files,
-)

@@ -1,37 +1,34 @@
 """All formats, and conversions between them, in which nothing is lost silently."""
 
-from collections.abc import Mapping
+import re
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
-from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.errors import CalibrationError, ConfigError, warn
 from alice_survey.core.frames import Array
 from camera_calib.camera import Camera
-from camera_calib.formats import colmap, metashape, opencv, rigs, yaml_files
+from camera_calib.formats import colmap, metashape, opencv, rigs, robots
 from camera_calib.formats.camera_files import MODELS
-from camera_calib.formats.fields import camera_name, read_text
-from camera_calib.formats.opencv_model import distorts, is_fisheye
+from camera_calib.formats.fields import YAML, camera_name, read_documents, read_text, yaml_files
+from camera_calib.formats.opencv_model import MATRIX, StandIn, distorts, fit_camera, is_fisheye
+from camera_calib.formats.rigs import CalibrationFormat
 from camera_calib.lenses.fisheye import FisheyeLens
 from camera_calib.lenses.opencv import OpenCVLens
-from camera_calib.lenses.values import FOCAL_AND_CENTRE
 from camera_calib.mount import mount_line, with_mount
 from camera_calib.ports.none import NO_PORT
 from camera_calib.rig import Rig, read_rig, write_rig
 
 _TERMS = {rigs.K3: ("k3",), rigs.RATIONAL: ("k4", "k5", "k6"), rigs.PRISM: ("s1", "s2", "s3", "s4")}
-
-
 _GRID, _DISTANCES = 15, 9
 """Places along each side of the frame, and distances, at which a camera without port is fitted."""
-_CANCELLING_PX = 0.01
-"""Penalty of a distortion coefficient of 1: of fits that hardly differ, it prefers the one with the
-smallest coefficients; the residual grows by less than 1 % for it."""
+
+
+_PLAIN = rigs.PINHOLE - {rigs.PRISM}
 
 
 def _write_own(path: Path, rig: Rig) -> list[Path]:
@@ -39,26 +36,54 @@ def _write_own(path: Path, rig: Rig) -> list[Path]:
     return [path]
 
 
-_OWN = rigs.CalibrationFormat(
-    name="rig",
-    title="rig.json of this project",
-    holds=rigs.ALL,
-    owns=lambda path: path.suffix.lower() == ".json" and read_text(path).lstrip()[:1] != "[",
-    read=lambda path, _: read_rig(path),
-    write=_write_own,
-    suffix=".json",
-)
+def _has(*keys: str, suffix: str | None = None) -> Callable[[Path, Mapping[str, Any]], bool]:
+    """Whether a YAML file has one of these keys, or another file this suffix."""
+    return lambda path, top: bool(set(keys) & set(top)) or path.suffix.lower() == suffix
+
+
 FORMATS = {
     each.name: each
     for each in (
-        _OWN, metashape.FORMAT, colmap.FORMAT, colmap.REFRACTIVE,
-        opencv.FORMAT, yaml_files.KALIBR, yaml_files.ROS,
+        CalibrationFormat(
+            "rig", "rig.json of this project",
+            lambda path, _: path.suffix.lower() == ".json" and read_text(path).lstrip()[:1] != "[",
+            lambda path, _: read_rig(path), _write_own, rigs.ALL, suffix=".json"),
+        CalibrationFormat(
+            "metashape", "Metashape calibration XML",
+            lambda path, _: path.suffix.lower() == ".xml"
+            and re.search(r"<calibration[\s>]", read_text(path, metashape.PICTURES)) is not None,
+            metashape.read_metashape, metashape.write_metashape, frozenset({rigs.K3}), 1),
+        CalibrationFormat(
+            "colmap", "COLMAP model and rig_config.json",
+            lambda path, _: colmap.has_ports(path) is False, colmap.read_colmap,
+            colmap.write_colmap, _PLAIN, files=colmap.model_files),
+        CalibrationFormat(
+            "refractive", "Refractive COLMAP cameras with FLATPORT or DOMEPORT",
+            lambda path, _: colmap.has_ports(path) is True, colmap.read_colmap,
+            colmap.write_refractive, rigs.PORTED - {rigs.PRISM}, files=colmap.model_files),
+        CalibrationFormat(
+            "kalibr", "Kalibr camchain YAML", _has("cam0"), robots.read_kalibr,
+            robots.write_kalibr, frozenset()),
+        CalibrationFormat("euroc", "EuRoC sensor YAML", _has("T_BS"), robots.read_kalibr),
+        CalibrationFormat(
+            "ros", "ROS camera_info YAML",
+            _has("rectification_matrix", "projection_matrix", "binning_x"), robots.read_ros,
+            robots.write_ros, _PLAIN, 1),
+        CalibrationFormat(
+            "orbslam", "ORB-SLAM YAML", _has("Camera.fx", "Camera1.fx"), robots.read_orbslam),
+        CalibrationFormat("zed", "ZED calibration", _has(suffix=".conf"), robots.read_zed),
+        CalibrationFormat(
+            "matisse", "Matisse YAML", _has("full_sensor_width"), opencv.read_opencv),
+        CalibrationFormat(
+            "opencv", "OpenCV YAML or XML",
+            _has(*(name + end for name in MATRIX for end in ("", "1")), suffix=".xml"),
+            opencv.read_opencv, opencv.write_opencv, rigs.PINHOLE, 2, ".xml"),
     )
 }  # fmt: skip
 """By name, in the order in which a file is asked whose it is."""
 
 
-def format_named(name: str) -> rigs.CalibrationFormat:
+def format_named(name: str) -> CalibrationFormat:
     """A format by its name.
 
     Raises:
@@ -69,7 +94,7 @@ def format_named(name: str) -> rigs.CalibrationFormat:
     return FORMATS[name]
 
 
-def detect(path: Path) -> rigs.CalibrationFormat:
+def detect(path: Path) -> CalibrationFormat:
     """The format of a file or folder, from its name and content.
 
     Raises:
@@ -77,20 +102,23 @@ def detect(path: Path) -> rigs.CalibrationFormat:
     """
     if not path.exists():
         raise CalibrationError(f"{path}: no such file or folder")
+    files = yaml_files(path) if path.is_dir() else [path]
+    is_yaml = bool(files) and files[0].suffix.lower() in YAML
+    top = read_documents(files[0])[0] if is_yaml else {}
     for each in FORMATS.values():
-        if each.owns(path):
+        if each.owns(path, top):
             return each
-    raise CalibrationError(f"{path}: of no known format: name it with --from")
+    raise CalibrationError(f"{path}: of no known format; those that are: {', '.join(FORMATS)}")
 
 
-def of_target(path: Path) -> rigs.CalibrationFormat:
+def of_target(path: Path) -> CalibrationFormat:
     """The format that the name of a new file calls for.
 
     Raises:
         CalibrationError: several formats have such names.
     """
     if path.name in colmap.CAMERA_FILES:
-        return colmap.FORMAT
+        return FORMATS["colmap"]
     for each in FORMATS.values():
         if each.suffix and each.suffix == path.suffix.lower():
             return each
@@ -181,7 +209,7 @@ def convert(task: Conversion) -> tuple[str, dict[str, Any]]:
     return "\n".join(lines), data
 
 
-def _read(source: rigs.CalibrationFormat, path: Path, reading: rigs.ReadOptions) -> Rig:
+def _read(source: CalibrationFormat, path: Path, reading: rigs.ReadOptions) -> Rig:
     """A rig; of several cameras the one that is named."""
     try:
         rig = source.read(path, reading)
@@ -212,9 +240,7 @@ def _change(rig: Rig, task: Conversion) -> Rig:
     return rig
 
 
-def fit_to_format(
-    rig: Rig, target: rigs.CalibrationFormat, task: Conversion
-) -> tuple[Rig, list[str]]:
+def fit_to_format(rig: Rig, target: CalibrationFormat, task: Conversion) -> tuple[Rig, list[str]]:
     """The part of a rig that a format holds, and notes of what was left out as requested.
 
     Raises:
@@ -265,21 +291,6 @@ def _may_lose_covariance(rig: Rig, task: Conversion, why: str) -> None:
 
 def _port_words(camera: Camera) -> str:
     return f"{camera.port.words}, water {camera.n_water:g}"
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class StandIn:
-    """A camera without port that stands in for one behind a port, and what it leaves."""
-
-    model: str
-    """COLMAP's name of its lens model."""
-    camera: Camera
-    approx_from_cam: RigidTransform
-    """From the exact camera's frame to its own."""
-    rms_px: float
-    """Error over the frame's area and the distances."""
-    max_px: float
-    """Largest error in the frame, its corners included, at any of the distances."""
 
 
 def in_water(rig: Rig, near_m: float, far_m: float) -> tuple[Rig, Mapping[str, StandIn]]:
@@ -339,38 +350,14 @@ def fit_in_water(camera: Camera, near_m: float, far_m: float) -> StandIn:
             "a part of the frame sees nothing: the lens model or the port does not reach the "
             "corners"
         )
-    side = np.r_[0.5, np.ones(_GRID - 2), 0.5] / (_GRID - 1)
-    weights = np.sqrt(np.outer(side, side) / _DISTANCES)[..., None]
-    axis = np.array(camera.port.axis_cam)
+    axis, stretch = np.array(camera.port.axis_cam), camera.port.magnification
     kind, model = (FisheyeLens, "OPENCV_FISHEYE") if is_fisheye(camera) else (OpenCVLens, "OPENCV")
-    names = MODELS[model][1]
+    fx, fy = stretch * camera.fx_px, stretch * camera.fy_px
+    lens = kind(fx_px=fx, fy_px=fy, cx_px=camera.cx_px, cy_px=camera.cy_px)
+    first = replace(camera, lens=lens, port=NO_PORT)
 
     def pose(unknowns: Array) -> RigidTransform:
         turn = Rotation.from_rotvec(unknowns[1:4])
         return RigidTransform.from_components(-turn.apply(unknowns[0] * axis), turn)
 
-    def errors(unknowns: Array) -> Array:
-        fx, fy, cx, cy, *terms = unknowns[4:]
-        matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-        project = cv2.fisheye.projectPoints if kind is FisheyeLens else cv2.projectPoints
-        seen = pose(unknowns).apply(points.reshape(-1, 3))[:, None]
-        found = project(seen, np.zeros(3), np.zeros(3), matrix, np.array(terms))[0]
-        residuals_px: Array = found.reshape(_DISTANCES, _GRID, _GRID, 2) - pixels
-        return residuals_px
-
-    def cost(unknowns: Array) -> Array:
-        return np.append(errors(unknowns) * weights, _CANCELLING_PX * unknowns[8:])
-
-    stretch = camera.port.magnification
-    start = [stretch * camera.fx_px, stretch * camera.fy_px, camera.cx_px, camera.cy_px]
-    first = np.array([0.0] * 4 + start + [0.0] * (len(names) - 4))
-    found = least_squares(cost, first, x_scale="jac", max_nfev=200).x
-    sizes = np.linalg.norm(errors(found), axis=-1)
-    values = dict(zip((*FOCAL_AND_CENTRE, *names[4:]), found[4:].tolist(), strict=True))
-    return StandIn(
-        model=model,
-        camera=replace(camera, lens=kind(**values), port=NO_PORT),
-        approx_from_cam=pose(found),
-        rms_px=float(np.sqrt(np.sum((sizes * weights[..., 0]) ** 2))),
-        max_px=float(sizes.max()),
-    )
+    return fit_camera(first, MODELS[model][1][4:], points, pixels, pose, 4)

@@ -6,20 +6,21 @@ YAML, OpenCV's FileStorage and JSON become plain values: nothing expands, nothin
 import json
 import math
 import re
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Self
 
 import cv2
 import numpy as np
+import pydantic
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, PlainSerializer, PlainValidator, ValidationError
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.artefacts import atomic_path
 from alice_survey.core.contents import as_line, first_fault, ordinary_file, refuse_declarations
-from alice_survey.core.errors import CalibrationError
+from alice_survey.core.errors import CalibrationError, warn
 from alice_survey.core.frames import Array
 
 _MAX_BYTES = 1 << 20
@@ -30,38 +31,73 @@ _MAX_PARTS = 5000
 hundred thousand levels, and handles 20,000)."""
 _ROTATION_TOLERANCE = 1e-3
 """Tolerance of a rotation matrix written with few digits (four decimals and better pass)."""
+YAML = (".yaml", ".yml")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 
 
 class FileModel(BaseModel):
-    """Values of a file by its keys, to read and to write; other keys are ignored."""
+    """Values of a file by its keys, to read and to write."""
 
     model_config = ConfigDict(
         frozen=True, allow_inf_nan=False, arbitrary_types_allowed=True, populate_by_name=True
     )
 
     @classmethod
-    def check(cls, path: Path, values: Any, prefix: str = "") -> Self:
+    def check(
+        cls, path: Path, values: Any, prefix: str = "", others: Collection[str] | None = None
+    ) -> Self:
         """The model of parsed values.
 
         Args:
             path: of their file, for messages.
             values: as parsers give them.
             prefix: keys that lead here, such as `cam0.`.
+            others: keys that are read elsewhere; a warning names further ones. None: no warning.
 
         Raises:
             CalibrationError: a value is missing or wrong; the message names file and key.
         """
         try:
-            return cls.model_validate(values)
+            found = cls.model_validate(values)
         except ValidationError as error:
             given = error.errors(include_url=False)[0]["input"]
             value = "" if isinstance(given, dict | list) else f" ({as_line(repr(given))[:60]})"
             raise CalibrationError(f"{path}: {prefix}{first_fault(error)}{value}") from None
+        if others is not None:
+            known = {*others, *cls.known()}
+            name_unread(path, (prefix + key for key in values if key not in known))
+        return found
+
+    @classmethod
+    def known(cls) -> Iterator[str]:
+        """The keys of its values."""
+        for name, field in cls.model_fields.items():
+            names = field.validation_alias
+            yield from (
+                names.choices if isinstance(names, pydantic.AliasChoices) else [names or name]
+            )  # type: ignore[misc]
 
     def values(self) -> dict[str, Any]:
         """What a file holds of it, by its keys."""
         return self.model_dump(mode="json", by_alias=True, exclude_none=True)
+
+
+def keys(*names: str) -> Any:
+    """A value that files call by any of these names, or lack."""
+    return Field(None, validation_alias=pydantic.AliasChoices(*names))
+
+
+def numbers_model(required: Iterable[str], optional: Iterable[str]) -> type[FileModel]:
+    """The model of finite numbers, each under its own key; those that are left out are 0."""
+    kinds: dict[str, Any] = dict.fromkeys(required, float) | dict.fromkeys(optional, (float, 0.0))
+    return pydantic.create_model("Numbers", __base__=FileModel, **kinds)
+
+
+def name_unread(path: Path, names: Iterable[str]) -> None:
+    """Warn of what a file holds and nothing reads."""
+    lost = list(dict.fromkeys(names))
+    if lost:
+        warn(f"{path}: not read: {as_line(', '.join(lost))}")
 
 
 def read_vector(counts: tuple[int, ...], value: Any) -> Array:
@@ -102,10 +138,6 @@ def _read_pose(value: Any) -> RigidTransform:
     return RigidTransform.from_components(matrix[:3, 3], _read_rotation(matrix[:3, :3].tolist()))
 
 
-def _as_list(array: Array) -> Any:
-    return array.tolist()
-
-
 def matrix_of(array: Array) -> dict[str, Any]:
     """A matrix, or a row of numbers, as OpenCV and ROS write it into YAML."""
     rows, columns = np.atleast_2d(array).shape
@@ -118,17 +150,14 @@ def _validator(read: Callable[..., Any], *shape: Any) -> PlainValidator:
 
 Pixels = Annotated[int, Field(ge=1, le=1_000_000)]
 """A number of pixels."""
-Numbers = Annotated[Array, _validator(read_vector, ()), PlainSerializer(_as_list)]
-Vector3 = Annotated[Array, _validator(read_vector, (3,)), PlainSerializer(_as_list)]
-Vector4 = Annotated[Array, _validator(read_vector, (4,)), PlainSerializer(_as_list)]
-Matrix33 = Annotated[Array, _validator(_read_matrix, 3, 3), PlainSerializer(matrix_of)]
-Matrix34 = Annotated[Array, _validator(_read_matrix, 3, 4), PlainSerializer(matrix_of)]
-Turn = Annotated[
-    Rotation, _validator(_read_rotation), PlainSerializer(lambda turn: matrix_of(turn.as_matrix()))
-]
-Pose = Annotated[
-    RigidTransform, _validator(_read_pose), PlainSerializer(lambda pose: pose.as_matrix().tolist())
-]
+_AsList = PlainSerializer(lambda array: array.tolist())
+Numbers = Annotated[Array, _validator(read_vector, ()), _AsList]
+Vector3 = Annotated[Array, _validator(read_vector, (3,)), _AsList]
+Vector4 = Annotated[Array, _validator(read_vector, (4,)), _AsList]
+Matrix33 = Annotated[Array, _validator(_read_matrix, 3, 3)]
+Matrix34 = Annotated[Array, _validator(_read_matrix, 3, 4)]
+Turn = Annotated[Rotation, _validator(_read_rotation)]
+Pose = Annotated[RigidTransform, _validator(_read_pose)]
 
 
 def read_bytes(path: Path, largest: int = _MAX_BYTES) -> bytes:
@@ -199,6 +228,12 @@ def camera_name(path: Path, name: str) -> str:
     return plain
 
 
+def plain_name(name: str) -> str:
+    """A name of a file made safe as a file name: other characters become underscores."""
+    plain = re.sub(r"[^A-Za-z0-9_.-]", "_", name.strip("/"))
+    return plain.lstrip("_.-") or "cam0"
+
+
 class _PlainLoader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
     """Safe YAML without aliases (which can grow without bound) and without repeated keys."""
 
@@ -220,21 +255,44 @@ class _PlainLoader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no type
         return values
 
 
-def read_yaml(path: Path) -> dict[str, Any]:
-    """A YAML file whose top is a mapping.
+def read_documents(path: Path) -> list[dict[str, Any]]:
+    """The documents of a YAML file, mappings all, or the one of a file of OpenCV's FileStorage.
 
     Raises:
-        CalibrationError: the file is missing, not YAML, or not a mapping of text keys.
+        CalibrationError: the file is missing, of neither kind, or not a mapping of text keys.
     """
     text = read_text(path)
+    if not text.strip():
+        raise CalibrationError(f"{path}: is empty")
+    if path.suffix.lower() not in YAML or "!!opencv-matrix" in text:
+        return [_read_storage(path, text)]
+    text = re.sub(r"^%YAML:.*", "", text)  # OpenCV's first line is not that of YAML
     try:
-        value = yaml.load(text, Loader=_PlainLoader)  # noqa: S506 - a SafeLoader
+        found = [one for one in yaml.load_all(text, Loader=_PlainLoader) if one is not None]
     except (yaml.YAMLError, RecursionError, ValueError, TypeError) as error:
         mark = getattr(error, "problem_mark", None)
         where = f", line {mark.line + 1}" if mark is not None else ""
         what = getattr(error, "problem", None) or type(error).__name__
         raise CalibrationError(f"{path}: not valid YAML{where}: {_one_line(what)}") from None
-    return _mapping(path, value)
+    return [_mapping(path, one) for one in found or [None]]
+
+
+def read_values(path: Path) -> dict[str, Any]:
+    """The one document of a file, as of `read_documents`.
+
+    Raises:
+        CalibrationError: as of `read_documents`, or there are several.
+    """
+    found = read_documents(path)
+    if len(found) > 1:
+        raise CalibrationError(f"{path}: {len(found)} YAML documents; 1 expected")
+    return found[0]
+
+
+def yaml_files(folder: Path) -> list[Path]:
+    """The YAML files of a folder, or those of its cameras as EuRoC's data sets have them."""
+    patterns = ("cam*/sensor.yaml", "mav0/cam*/sensor.yaml", "*.[yY]*[mM][lL]")
+    return next((files for each in patterns if (files := sorted(folder.glob(each)))), [])
 
 
 def write_yaml(path: Path, document: Any) -> None:
@@ -256,15 +314,8 @@ def read_json_values(path: Path) -> Any:
         raise CalibrationError(f"{path}: not valid JSON: {_one_line(str(error))}") from None
 
 
-def read_storage(path: Path) -> dict[str, Any]:
-    """A YAML, XML or JSON file of OpenCV's FileStorage; matrices are `{rows, cols, dt, data}`.
-
-    Raises:
-        CalibrationError: the file is missing, is not such a file, or repeats a key.
-    """
-    text = read_text(path)
-    if not text.strip():
-        raise CalibrationError(f"{path}: is empty")
+def _read_storage(path: Path, text: str) -> dict[str, Any]:
+    """Values of OpenCV's YAML, XML or JSON; matrices are `{rows, cols, dt, data}`."""
     storage = cv2.FileStorage()
     try:
         if not storage.open(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY):
@@ -295,7 +346,7 @@ def _plain(path: Path, node: Any) -> Any:
 
 
 def write_storage(path: Path, values: Mapping[str, Any]) -> None:
-    """Write what `read_storage` reads: arrays, numbers, texts and lists of texts."""
+    """Write what `read_documents` reads: arrays, numbers, texts and lists of texts."""
     suffix = ".xml" if path.suffix.lower() == ".xml" else ".yml"
     storage = cv2.FileStorage(suffix, cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
 

@@ -4,52 +4,27 @@ One camera has `camera_matrix` and `distortion_coefficients` (also of ROS and of
 two have `M1 D1 M2 D2` and the second's pose `R T` in the first (x2 = R x1 + T), as the sample
 `stereo_calib.cpp` names them; `camera_names` is a key of our own. Four coefficients
 are k1 k2 p1 p2 of a pinhole or k1 to k4 of `cv2.fisheye`: `distortion_model` (with 1 or 2 where the
-lenses of a pair differ) or the caller says which; without either it is a pinhole.
+lenses of a pair differ) or the caller says which; without either it is a pinhole. Values of a pair
+without a number are those of both cameras.
+
+Matisse (github.com/IfremerUnderwater/Matisse) calibrates with OpenCV and writes the same with keys
+of its own: models 0 to 2 are pinholes, 3 a fisheye; three coefficients are k1 k2 k3.
 """
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from pydantic import Field
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.core.errors import CalibrationError, warn
-from camera_calib.camera import Camera
+from alice_survey.core.errors import CalibrationError
 from camera_calib.formats import fields, opencv_model, rigs
 from camera_calib.rig import Rig
-
-_KEYS: Mapping[str, tuple[str, ...]] = {
-    "camera_matrix": ("camera_matrix", "cameraMatrix", "Camera_Matrix", "M", "K"),
-    "distortion_coefficients": (
-        "distortion_coefficients", "distCoeffs", "Distortion_Coefficients", "D"
-    ),
-    "distortion_model": ("distortion_model",),
-    "image_width": ("image_width", "image_Width"),
-    "image_height": ("image_height", "image_Height"),
-}  # fmt: skip
-"""Other keys of what a camera has; of a pair they end in the camera's number."""
-_OF_BOTH = ("distortion_model", "image_width", "image_height")
-"""May be stated once for both."""
-
-
-class _OpenCVCamera(fields.FileModel):
-    camera_matrix: fields.Matrix33
-    distortion_coefficients: fields.Numbers | None = None
-    distortion_model: str | None = None
-    image_width: fields.Pixels | None = None
-    image_height: fields.Pixels | None = None
 
 
 class _PairPose(fields.FileModel):
     rotation: fields.Turn = Field(alias="R")
     shift: fields.Vector3 = Field(alias="T")
-
-
-class _Names(fields.FileModel):
-    camera_name: str | None = None
-    camera_names: list[str] | str | None = None
-    """OpenCV's XML has no other way to write a list of one than its text."""
 
 
 def read_opencv(path: Path, reading: rigs.ReadOptions) -> Rig:
@@ -58,18 +33,19 @@ def read_opencv(path: Path, reading: rigs.ReadOptions) -> Rig:
     Raises:
         CalibrationError: a key is missing or wrong; the message names file and key.
     """
-    values = fields.read_storage(path)
-    if {"port", "port1", "port2", "covariance"} & set(values):
-        raise CalibrationError(
-            f"{path}: holds ports or a covariance, as versions before 0.2 wrote them: use "
-            "rig.json, or remove these keys and state the port with --port-distance and --glass"
-        )
-    single = any(key in values for key in _KEYS["camera_matrix"])
-    numbers = [""] if single else ["1", "2"]
-    cameras = [_camera(path, values, number, reading) for number in numbers]
+    values = fields.read_values(path)
+    single = any(key in values for key in opencv_model.MATRIX)
+    cameras, read = [], set[str]() if single else {"R", "T"}
+    for number in ("",) if single else ("1", "2"):
+        keys = {key + end: key for end in ("", number) for key in opencv_model.CameraKeys.known()}
+        own = {key: values[name] for name, key in keys.items() if name in values}
+        prefix, read = f"camera {number}: " if number else "", read | set(keys)
+        found = opencv_model.CameraKeys.check(path, own, prefix)
+        cameras.append(found.camera(path, prefix, reading))
+    fields.name_unread(path, (key for key in values if key not in read))
     poses = list(rigs.ONE)
     if not single:
-        other = values if reading.extrinsics is None else fields.read_storage(reading.extrinsics)
+        other = values if reading.extrinsics is None else fields.read_values(reading.extrinsics)
         if reading.extrinsics is None and not {"R", "T"} & set(values):
             raise CalibrationError(
                 f"{path}: lacks R and T of the second camera: name the file that holds them with "
@@ -77,9 +53,8 @@ def read_opencv(path: Path, reading: rigs.ReadOptions) -> Rig:
             )
         pose = _PairPose.check(reading.extrinsics or path, other)
         poses.append(RigidTransform.from_components(pose.shift, pose.rotation))
-    found = _Names.check(path, values)
-    usual = ["cam0"] if single else ["left", "right"]
-    stated = found.camera_names or (found.camera_name if single else None) or usual
+    usual = [found.name or "cam0"] if single else ["left", "right"]
+    stated = found.names or usual
     names = [stated] if isinstance(stated, str) else stated
     if len(names) != len(cameras):
         raise CalibrationError(
@@ -109,52 +84,3 @@ def write_opencv(path: Path, rig: Rig) -> list[Path]:
     values["camera_names"] = list(rig.cameras)
     fields.write_storage(path, values)
     return [path]
-
-
-def _camera(
-    path: Path, values: Mapping[str, Any], number: str, reading: rigs.ReadOptions
-) -> Camera:
-    own = {}
-    for field, names in _KEYS.items():
-        ends = (number, "") if field in _OF_BOTH else (number,)
-        known = [name + end for end in ends for name in names if name + end in values]
-        if known:
-            own[field] = values[known[0]]
-    if "camera_matrix" not in own:
-        raise CalibrationError(
-            f"{path}: lacks camera_matrix, or M{number or 1} of a stereo pair: is it a calibration?"
-        )
-    prefix = f"camera {number}: " if number else ""
-    found = _OpenCVCamera.check(path, own, prefix)
-    k, model = found.distortion_coefficients, found.distortion_model
-    name, where = model or reading.lens or "opencv", f"{path}: {prefix}"
-    if name not in opencv_model.LENS_NAMES:
-        key = "--lens" if model is None else "distortion_model"
-        lenses = ", ".join(opencv_model.LENS_NAMES)
-        raise CalibrationError(f"{where}{key} is {name}; {lenses} can be read")
-    if k is not None and len(k) == 4 and model is None and reading.lens is None:
-        warn(f"{where}4 coefficients taken for k1 k2 p1 p2: a fisheye needs --lens fisheye")
-    size = (found.image_width or 0, found.image_height or 0)
-    size = size if all(size) else reading.size(path)
-    lens, key = opencv_model.LENS_NAMES[name], f"{where}camera_matrix"
-    return opencv_model.camera_of_matrix(key, found.camera_matrix, k, size, lens)
-
-
-def _owns(path: Path) -> bool:
-    if path.is_dir() or path.suffix.lower() == ".json":
-        return False
-    text = fields.read_text(path)
-    marked = text.startswith("%YAML:1.") or "!!opencv-matrix" in text
-    return marked or path.suffix.lower() == ".xml"
-
-
-FORMAT = rigs.CalibrationFormat(
-    name="opencv",
-    title="OpenCV YAML or XML",
-    holds=rigs.PINHOLE,
-    owns=_owns,
-    read=read_opencv,
-    write=write_opencv,
-    suffix=".xml",
-    max_cameras=2,
-)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import RigidTransform
 
 from alice_survey.core.errors import CalibrationError
 from camera_calib.camera import Camera
-from camera_calib.formats.fields import camera_name
+from camera_calib.formats.fields import camera_name, plain_name
 from camera_calib.freedom import part_of_rig
 from camera_calib.optics import PORTS
 from camera_calib.ports.dome import DomePort
@@ -19,7 +19,8 @@ from camera_calib.rig import Rig
 
 K3, RATIONAL, PRISM, COVARIANCE, MOUNT = "k3", "rational", "prism", "covariance", "mount"
 PINHOLE = frozenset({K3, RATIONAL, PRISM})
-ALL = PINHOLE | {COVARIANCE, MOUNT, *PORTS}
+PORTED = PINHOLE | {*PORTS}
+ALL = PORTED | {COVARIANCE, MOUNT}
 ONE = (RigidTransform.identity(),)
 """Pose of a camera alone."""
 
@@ -50,24 +51,29 @@ class ReadOptions:
         return self.image_size
 
 
-@dataclass(frozen=True, kw_only=True)
+def refuse_writing(path: Path, _: Rig) -> list[Path]:
+    """The writer of a format that is only read."""
+    raise CalibrationError(f"{path}: this format is only read: name another with --to")
+
+
+@dataclass(frozen=True)
 class CalibrationFormat:
-    """One tool's format: what it holds, how it is recognised, read and written."""
+    """One tool's format: how it is recognised, read and written, and what it holds."""
 
     name: str
     title: str
-    holds: frozenset[str]
-    """More than fisheyes and k1 k2 p1 p2: terms, ports, and what belongs to the rig."""
-    owns: Callable[[Path], bool]
-    """Whether a file or folder is of this format."""
+    owns: Callable[[Path, Mapping[str, Any]], bool]
+    """Whether a file or folder is of this format, of which it has the top values if it is YAML."""
     read: Callable[[Path, ReadOptions], Rig]
-    write: Callable[[Path, Rig], list[Path]]
-    files: Callable[[Path, Rig], list[Path]] = lambda path, _: [path]
-    """The files that writing a rig to a path would replace."""
-    suffix: str = ""
-    """Ending of new files that are of this format if none is named."""
+    write: Callable[[Path, Rig], list[Path]] = refuse_writing
+    holds: frozenset[str] = ALL
+    """More than fisheyes and k1 k2 p1 p2: terms, ports, and what belongs to the rig."""
     max_cameras: int | None = None
     """Cameras that it holds; None: any number."""
+    suffix: str = ""
+    """Ending of new files that are of this format if none is named."""
+    files: Callable[[Path, Rig], list[Path]] = lambda path, _: [path]
+    """The files that writing a rig to a path would replace."""
 
 
 def assemble(
@@ -81,9 +87,9 @@ def assemble(
     """A rig of cameras and poses in the units of a file; the first camera becomes the reference.
 
     Raises:
-        CalibrationError: a name is invalid or occurs twice.
+        CalibrationError: a name occurs twice.
     """
-    plain = [camera_name(path, name) for name in names]
+    plain = [plain_name(name) for name in names]
     if len(set(plain)) != len(plain):
         raise CalibrationError(f"{path}: two cameras of one name ({', '.join(plain)})")
     poses = [

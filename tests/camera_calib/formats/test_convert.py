@@ -19,12 +19,12 @@ from camera_calib.camera import Camera
 from camera_calib.formats.convert import (
     FORMATS,
     Conversion,
-    StandIn,
     convert,
     detect,
     fit_in_water,
     in_water,
 )
+from camera_calib.formats.opencv_model import StandIn
 from camera_calib.formats.rigs import ReadOptions, in_air, only, rename_cameras, with_port
 from camera_calib.lenses.fisheye import FisheyeLens
 from camera_calib.ports.dome import DomePort

@@ -12,7 +12,8 @@ from alice_survey.core.errors import CalibrationError, ConfigError
 from camera_calib.approximation.pinhole_warp import best_warp, residual_px
 from camera_calib.camera import Camera
 from camera_calib.formats.camera_files import record_of
-from camera_calib.formats.convert import StandIn, fit_in_water
+from camera_calib.formats.convert import fit_in_water
+from camera_calib.formats.opencv_model import StandIn
 from camera_calib.lenses.fisheye import FisheyeLens
 from tests.camera_calib.approximation.ports import CAMERA, STUDY, behind_port
 from tests.cameras import changed

@@ -12,7 +12,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from camera_calib.formats.convert import detect
 from camera_calib.formats.rigs import ReadOptions
-from camera_calib.formats.yaml_files import read_kalibr, write_kalibr
+from camera_calib.formats.robots import read_kalibr, write_kalibr
 from camera_calib.rig import Rig
 from tests import strategies_formats
 
@@ -81,7 +81,7 @@ def test_an_example_like_that_of_the_wiki_is_read(
     np.testing.assert_allclose(centre, [0.0, -0.1, 0.0], atol=1e-15)
     centre = rig.cam_from_rig["cam2"].inv().translation
     np.testing.assert_allclose(centre, [0.5, -0.1, 0.0], atol=1e-15)
-    assert "T_cam_imu, timeshift_cam_imu" in capsys.readouterr().err
+    assert "cam0.T_cam_imu, cam0.timeshift_cam_imu" in capsys.readouterr().err
 
 
 def test_rounded_rotations_are_made_rotations(tmp_path: Path) -> None:
@@ -98,7 +98,8 @@ def test_faults_name_file_and_key(tmp_path: Path) -> None:
     for old, new, named in (
         ("distortion_model: none", "distortion_model: fov", "cam1.distortion_model"),
         ("distortion_model: none", "distortion_model: equidistant", "cam1.distortion_coeffs"),
-        ("pinhole", "omni", "cam0.camera_model"),
+        ("pinhole", "spherical", "cam0.camera_model"),
+        ("pinhole", "omni", "cam0.intrinsics"),
         (", 1e-05]", "]", "cam0.distortion_coeffs"),
         ("461.629", "fast", "cam0.intrinsics"),
         ("461.629", "-461.629", "cam0.intrinsics"),

@@ -15,7 +15,7 @@ from scipy.spatial.transform import RigidTransform
 
 from camera_calib.formats.convert import detect
 from camera_calib.formats.rigs import ReadOptions, only
-from camera_calib.formats.yaml_files import read_ros, write_ros
+from camera_calib.formats.robots import read_ros, write_ros
 from camera_calib.rig import Rig
 from tests.cameras import changed, flat_port_camera, pair_of
 from tests.strategies_formats import (
@@ -136,12 +136,10 @@ def test_faults_name_file_and_key(tmp_path: Path) -> None:
     path = tmp_path / "a.yaml"
     for old, new, named in (
         ("plumb_bob", "fov", "distortion_model"),
-        ("plumb_bob", "equidistant", "distortion_coefficients"),
-        ("plumb_bob", "rational_polynomial", "distortion_coefficients"),
-        ("image_width", "width", "image_width"),
+        ("7.1e-04, 0]", "7.1e-04, 0, 1]", "distortion_coefficients"),
+        ("image_width: 2448\n", "", "--image-size"),
         ("0, 0, 1]\nd", "0, 0]\nd", "camera_matrix"),
         ("4827.94, 0,", "4827.94, 1,", "camera_matrix"),
-        ("prosilica", "a b", "a b"),
         ("cols: 4", "cols: 3", "projection_matrix"),
     ):
         assert named in fault(path, SAMPLE.replace(old, new, 1))
@@ -153,7 +151,7 @@ def test_faults_name_file_and_key(tmp_path: Path) -> None:
     fault(folder)
     moved = SAMPLE.replace("1223.5, 0, 0, 4835.62", "1223.5, -99.0, 0, 4835.62")
     (folder / "b.yaml").write_text(moved)
-    fault(folder)
+    assert list(read_ros(folder, ReadOptions()).cameras) == ["cam0", "cam1"]
     (folder / "b.yaml").write_text(
         moved.replace("prosilica", "other").replace("[1, 0, 0, 0, 1", "[1, 0, 0, 0, 3")
     )
