@@ -26,8 +26,6 @@ from camera_calib.rig import Rig, read_rig, write_rig
 _TERMS = {rigs.K3: ("k3",), rigs.RATIONAL: ("k4", "k5", "k6"), rigs.PRISM: ("s1", "s2", "s3", "s4")}
 _GRID, _DISTANCES = 15, 9
 """Places along each side of the frame, and distances, at which a camera without port is fitted."""
-
-
 _PLAIN = rigs.PINHOLE - {rigs.PRISM}
 
 
@@ -45,10 +43,6 @@ FORMATS = {
     each.name: each
     for each in (
         CalibrationFormat(
-            "rig", "rig.json of this project",
-            lambda path, _: path.suffix.lower() == ".json" and read_text(path).lstrip()[:1] != "[",
-            lambda path, _: read_rig(path), _write_own, rigs.ALL, suffix=".json"),
-        CalibrationFormat(
             "metashape", "Metashape calibration XML",
             lambda path, _: path.suffix.lower() == ".xml"
             and re.search(r"<calibration[\s>]", read_text(path, metashape.PICTURES)) is not None,
@@ -61,6 +55,9 @@ FORMATS = {
             "refractive", "Refractive COLMAP cameras with FLATPORT or DOMEPORT",
             lambda path, _: colmap.has_ports(path) is True, colmap.read_colmap,
             colmap.write_refractive, rigs.PORTED - {rigs.PRISM}, files=colmap.model_files),
+        CalibrationFormat(
+            "rig", "rig.json of this project", _has(suffix=".json"),
+            lambda path, _: read_rig(path), _write_own, suffix=".json"),
         CalibrationFormat(
             "kalibr", "Kalibr camchain YAML", _has("cam0"), robots.read_kalibr,
             robots.write_kalibr, frozenset()),
@@ -169,8 +166,7 @@ def convert(task: Conversion) -> tuple[str, dict[str, Any]]:
         _may_lose_covariance(rig, task, f"{task.target}: cameras fitted in water have no longer")
         rig, prices = in_water(rig, *task.water)
     for name in rig.cameras:  # they become names of files and folders
-        if camera_name(task.source, name) != name:
-            raise CalibrationError(f"{task.source}: camera name {name!r} has a slash: give --names")
+        camera_name(task.source, name)
     rig, notes = fit_to_format(rigs.refer_to_first(rig), target, task)
     existing = [path for path in target.files(task.target, rig) if path.is_file()]
     if existing and not task.overwrite:

@@ -215,17 +215,16 @@ def read_text(path: Path, skipped: tuple[bytes, bytes] | None = None) -> str:
 
 
 def camera_name(path: Path, name: str) -> str:
-    """A name that is safe as a file name; slashes become underscores.
+    """A name that is safe as a file name.
 
     Raises:
         CalibrationError: other characters than letters, digits, `_`, `.` and `-`.
     """
-    plain = name.strip("/").replace("/", "_")
-    if not _NAME.fullmatch(plain):
+    if not _NAME.fullmatch(name):
         raise CalibrationError(
             f"{path}: camera name {name!r} needs letters, digits, _ . - only: choose with --names"
         )
-    return plain
+    return name
 
 
 def plain_name(name: str) -> str:

@@ -47,19 +47,14 @@ def read_opencv(path: Path, reading: rigs.ReadOptions) -> Rig:
     if not single:
         other = values if reading.extrinsics is None else fields.read_values(reading.extrinsics)
         if reading.extrinsics is None and not {"R", "T"} & set(values):
-            raise CalibrationError(
-                f"{path}: lacks R and T of the second camera: name the file that holds them with "
-                "--extrinsics"
-            )
+            raise CalibrationError(f"{path}: lacks R and T: name their file with --extrinsics")
         pose = _PairPose.check(reading.extrinsics or path, other)
         poses.append(RigidTransform.from_components(pose.shift, pose.rotation))
     usual = [found.name or "cam0"] if single else ["left", "right"]
     stated = found.names or usual
     names = [stated] if isinstance(stated, str) else stated
     if len(names) != len(cameras):
-        raise CalibrationError(
-            f"{path}: camera_names has {len(names)} names for {len(cameras)} cameras"
-        )
+        raise CalibrationError(f"{path}: camera_names: {len(names)}; {len(cameras)} expected")
     return rigs.assemble(path, reading, "OpenCV", names, cameras, poses)
 
 

@@ -41,7 +41,6 @@ _FOLDED_PX = 1e4
 _GRID, _ROUNDS = 15, 4
 """Places along each side of the frame at which a lens is fitted; fits with rays of the last."""
 Terms = fields.numbers_model(("fx", "fy", "cx", "cy"), COEFFICIENTS)
-
 MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "M", "K", "k", "mtx")
 
 
@@ -81,9 +80,7 @@ class CameraKeys(fields.FileModel):
             key = "--lens" if self.model is None else "distortion_model"
             raise CalibrationError(f"{where}{key} is {name}; {', '.join(LENS_NAMES)} can be read")
         if self.matrix is None:
-            raise CalibrationError(
-                f"{where}lacks camera_matrix, or M1 and M2 of a stereo pair: is it a calibration?"
-            )
+            raise CalibrationError(f"{where}lacks camera_matrix: is it a calibration?")
         if k is not None and len(k) == 4 and self.model is None and reading.lens is None:
             warn(f"{where}4 coefficients taken for k1 k2 p1 p2: a fisheye needs --lens fisheye")
         size = (self.width, self.height) if self.width and self.height else reading.size(path)

@@ -79,11 +79,12 @@ class _KalibrCamera(opencv_model.CameraKeys):
         projection, model, where = self.camera_model, self.distortion_model, f"{path}: {prefix}"
         count, depth = _DEPTHS[projection]
         k = np.zeros(0) if self.coefficients is None or model == "none" else self.coefficients
-        expected = {"intrinsics": (self.intrinsics, count + 4)}
-        expected["distortion_coeffs"] = (k, 0 if model == "none" else 4)
-        for key, (numbers, length) in expected.items():
-            if len(numbers) != length:
-                raise CalibrationError(f"{where}{key}: {len(numbers)}; {length} expected")
+        for key, found, expected in (
+            ("intrinsics", self.intrinsics, count + 4),
+            ("distortion_coeffs", k, 4 * (model != "none")),
+        ):  # fmt: skip
+            if len(found) != expected:
+                raise CalibrationError(f"{where}{key}: {len(found)}; {expected} expected")
         own, flat, size = self.intrinsics[:count], self.intrinsics[count:], self.resolution
         where, lens = f"{where}intrinsics", opencv_model.LENS_NAMES[model]
         plain = opencv_model.camera_of_numbers(where, [*flat, *k], size, lens)
@@ -199,13 +200,9 @@ def read_ros(path: Path, reading: rigs.ReadOptions) -> Rig:
         poses = [*rigs.ONE, _second_from_first(*every)]
     else:
         raise CalibrationError(
-            f"{path}: one of two projection_matrix needs a baseline in its last column and the "
-            f"other none; {sum(moved)} have one"
+            f"{path}: {sum(moved)} projection_matrix have a baseline; 1 expected"
         )
-    names = [
-        one.name or str(one.header.get("frame_id") or (f.stem if len(files) > 1 else "cam0"))
-        for f, one in every
-    ]
+    names = [str(one.name or one.header.get("frame_id") or file.stem) for file, one in every]
     names = names if len(set(names)) == len(names) else ["cam0", "cam1"]
     cameras = [one.camera(file, "", reading) for file, one in every]
     return rigs.assemble(path, reading, "ROS", names, cameras, poses)

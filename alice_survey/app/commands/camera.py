@@ -29,7 +29,8 @@ class CameraCommand(ReportCommand):
 class ConvertCommand(ReportCommand):
     """Convert between tools.
 
-    OpenCV, COLMAP, Refractive COLMAP, Kalibr, ROS, Metashape, rig.json; nothing is lost silently.
+    OpenCV, COLMAP, Refractive COLMAP, Kalibr, ROS, Metashape, rig.json; from EuRoC, ORB-SLAM, ZED
+    and Matisse. Nothing is lost silently.
     """
 
     name = "camera convert"
