@@ -207,7 +207,7 @@ def _read_config(path: Path) -> list[_ConfigCamera]:
     rigs = fields.read_json_values(path)
     if not isinstance(rigs, list) or len(rigs) != 1:
         raise CalibrationError(f"{path}: a list of one rig expected")
-    rig = _RigConfig.check(path, rigs[0])
+    rig = _RigConfig.check(path, rigs[0], "", ())
     references = [
         entry
         for entry in rig.cameras

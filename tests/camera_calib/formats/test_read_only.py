@@ -59,7 +59,7 @@ def omni(xi: float, k: Any, p: Array) -> Array:
     return pinhole(k, p / np.linalg.norm(p, axis=1, keepdims=True) + [0.0, 0.0, xi])
 
 
-def enhanced(alpha: float, beta: float, p: Array) -> Array:
+def extended_unified(alpha: float, beta: float, p: Array) -> Array:
     d = np.sqrt(beta * (p[:, 0] ** 2 + p[:, 1] ** 2) + p[:, 2] ** 2)
     return np.diag(K)[:2] * p[:, :2] / (alpha * d + (1 - alpha) * p[:, 2])[:, None] + K[:2, 2]
 
@@ -126,7 +126,7 @@ def manual(text: str, p: Array) -> Array:
 
 FITS: list[tuple[str, Project | None, float]] = [
     ("ds", partial(double_sphere, -0.2, 0.6), 1e-3),
-    ("eucm", partial(enhanced, 0.6, 1.1), 1e-3),
+    ("eucm", partial(extended_unified, 0.6, 1.1), 1e-3),
     ("omni", partial(omni, 0.9, FOUR), 3.0),
     (metashape("frame", "<k4>0.01</k4>"), None, 0.05),
     (metashape("frame", "<b2>-2.5</b2>"), None, 2.0),
