@@ -64,12 +64,12 @@ class FileModel(BaseModel):
             value = "" if isinstance(given, dict | list) else f" ({as_line(repr(given))[:60]})"
             raise CalibrationError(f"{path}: {prefix}{first_fault(error)}{value}") from None
         if others is not None:
-            known = {*others, *cls.known()}
+            known = {*others, *cls.known_keys()}
             name_unread(path, (prefix + key for key in values if key not in known))
         return found
 
     @classmethod
-    def known(cls) -> Iterator[str]:
+    def known_keys(cls) -> Iterator[str]:
         """The keys of its values."""
         for name, field in cls.model_fields.items():
             names = field.validation_alias

@@ -112,7 +112,7 @@ def _camera(path: Path, element: ET.Element) -> Camera:
     if "fx" in values:
         values = {_OLD.get(name, name): value for name, value in values.items()}
     found = _MetashapeCamera.check(path, values)
-    others = (*_MetashapeCamera.known(), "resolution", "date")
+    others = (*_MetashapeCamera.known_keys(), "resolution", "date")
     t, size = _Numbers.check(path, values, "", others).model_dump(), (found.width, found.height)
     if t["fx"]:
         t |= {"b1": t["fx"] - t["f"], "cx": t["cx"] - 0.5 * size[0], "cy": t["cy"] - 0.5 * size[1]}

@@ -35,12 +35,12 @@ def read_opencv(path: Path, reading: rigs.ReadOptions) -> Rig:
     """
     values = fields.read_values(path)
     single = any(key in values for key in opencv_model.MATRIX)
-    cameras, read = [], set[str]() if single else {"R", "T"}
+    cameras, read, model = [], set[str]() if single else {"R", "T"}, opencv_model.CameraKeys
     for number in ("",) if single else ("1", "2"):
-        keys = {key + end: key for end in ("", number) for key in opencv_model.CameraKeys.known()}
+        keys = {key + end: key for end in ("", number) for key in model.known_keys()}
         own = {key: values[name] for name, key in keys.items() if name in values}
         prefix, read = f"camera {number}: " if number else "", read | set(keys)
-        found = opencv_model.CameraKeys.check(path, own, prefix)
+        found = model.check(path, own, prefix)
         cameras.append(found.camera(path, prefix, reading))
     fields.name_unread(path, (key for key in values if key not in read))
     poses = list(rigs.ONE)

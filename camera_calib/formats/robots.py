@@ -112,7 +112,7 @@ def read_kalibr(path: Path, reading: rigs.ReadOptions) -> Rig:
     entries = _kalibr_entries(path)
     every = [_KalibrCamera.check(path, values, prefix) for _, prefix, values in entries]
     is_chain = all(one.pose is not None for one in every[1:])
-    known = {*_KalibrCamera.known(), *(() if is_chain else _BodyPose.known())}
+    known = {*_KalibrCamera.known_keys(), *(() if is_chain else _BodyPose.known_keys())}
     fields.name_unread(
         path, (prefix + key for _, prefix, values in entries for key in values if key not in known)
     )
@@ -258,12 +258,12 @@ def read_orbslam(path: Path, reading: rigs.ReadOptions) -> Rig:
     Raises:
         CalibrationError: a key is missing or wrong.
     """
-    values, known = fields.read_values(path), {*_OrbSettings.known()}
+    values, known = fields.read_values(path), {*_OrbSettings.known_keys()}
     one = _OrbSettings.check(path, values)
     size = (one.width, one.height) if one.width and one.height else reading.size(path)
     lens, cameras, poses = opencv_model.LENS_NAMES[one.kind], [], list(rigs.ONE)
     for part in ("Camera.", "Camera1.", "Camera2."):
-        keys = {part + name: name for name in opencv_model.Terms.known()}
+        keys = {part + name: name for name in opencv_model.Terms.known_keys()}
         own = {name: values[key] for key, name in keys.items() if key in values}
         if "fx" in own:
             cameras.append(opencv_model.camera_of_terms(path, part, own, size, lens))
