@@ -14,7 +14,7 @@ from alice_survey.core.frames import Array
 from camera_calib.camera import Camera
 from camera_calib.formats import colmap, metashape, opencv, rigs, robots
 from camera_calib.formats.camera_files import MODELS
-from camera_calib.formats.fields import YAML, camera_name, read_documents, read_text, yaml_files
+from camera_calib.formats.fields import PLAIN, camera_name, read_documents, read_text, yaml_files
 from camera_calib.formats.opencv_model import MATRIX, StandIn, distorts, fit_camera, is_fisheye
 from camera_calib.formats.rigs import CalibrationFormat
 from camera_calib.lenses.fisheye import FisheyeLens
@@ -56,9 +56,6 @@ FORMATS = {
             lambda path, _: colmap.has_ports(path) is True, colmap.read_colmap,
             colmap.write_refractive, rigs.PORTED - {rigs.PRISM}, files=colmap.model_files),
         CalibrationFormat(
-            "rig", "rig.json of this project", _has(suffix=".json"),
-            lambda path, _: read_rig(path), _write_own, suffix=".json"),
-        CalibrationFormat(
             "kalibr", "Kalibr camchain YAML", _has("cam0"), robots.read_kalibr,
             robots.write_kalibr, frozenset()),
         CalibrationFormat("euroc", "EuRoC sensor YAML", _has("T_BS"), robots.read_kalibr),
@@ -75,6 +72,9 @@ FORMATS = {
             "opencv", "OpenCV YAML or XML",
             _has(*(name + end for name in MATRIX for end in ("", "1")), suffix=".xml"),
             opencv.read_opencv, opencv.write_opencv, rigs.PINHOLE, 2, ".xml"),
+        CalibrationFormat(
+            "rig", "rig.json of this project", _has(suffix=".json"),
+            lambda path, _: read_rig(path), _write_own, suffix=".json"),
     )
 }  # fmt: skip
 """By name, in the order in which a file is asked whose it is."""
@@ -100,8 +100,7 @@ def detect(path: Path) -> CalibrationFormat:
     if not path.exists():
         raise CalibrationError(f"{path}: no such file or folder")
     files = yaml_files(path) if path.is_dir() else [path]
-    is_yaml = bool(files) and files[0].suffix.lower() in YAML
-    top = read_documents(files[0])[0] if is_yaml else {}
+    top = read_documents(files[0])[0] if files and files[0].suffix.lower() in PLAIN else {}
     for each in FORMATS.values():
         if each.owns(path, top):
             return each

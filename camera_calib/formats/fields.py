@@ -31,7 +31,8 @@ _MAX_PARTS = 5000
 hundred thousand levels, and handles 20,000)."""
 _ROTATION_TOLERANCE = 1e-3
 """Tolerance of a rotation matrix written with few digits (four decimals and better pass)."""
-YAML = (".yaml", ".yml")
+PLAIN = (".yaml", ".yml", ".json")
+"""Endings of files that are known by their keys."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 
 
@@ -263,7 +264,10 @@ def read_documents(path: Path) -> list[dict[str, Any]]:
     text = read_text(path)
     if not text.strip():
         raise CalibrationError(f"{path}: is empty")
-    if path.suffix.lower() not in YAML or "!!opencv-matrix" in text:
+    if path.suffix.lower() == ".json":
+        values = read_json_values(path)
+        return [_mapping(path, one) for one in (values if isinstance(values, list) else [values])]
+    if path.suffix.lower() not in PLAIN or "!!opencv-matrix" in text:
         return [_read_storage(path, text)]
     text = re.sub(r"^%YAML:.*", "", text)  # OpenCV's first line is not that of YAML
     try:

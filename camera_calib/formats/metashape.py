@@ -69,10 +69,10 @@ def read_metashape(path: Path, reading: rigs.ReadOptions) -> Rig:
     if top.tag == "calibration":
         return rigs.assemble(path, reading, "Metashape", ["cam0"], [_camera(path, top)], rigs.ONE)
     sensors = {
-        str(sensor.get("label") or sensor.get("id")): sensor.find("calibration")
+        str(sensor.get("label") or sensor.get("id")): sensor.findall("calibration")
         for sensor in top.iter("sensor")
     }
-    known = {name: found for name, found in sensors.items() if found is not None}
+    known = {name: found[-1] for name, found in sensors.items() if found}  # the first is initial
     chosen = known if reading.camera is None else {reading.camera: known.get(reading.camera)}
     ((name, element),) = chosen.items() if len(chosen) == 1 else [("", None)]
     if element is None:

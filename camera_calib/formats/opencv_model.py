@@ -59,6 +59,7 @@ class CameraKeys(fields.FileModel):
     height: fields.Pixels | None = fields.keys(
         "image_height", "image_Height", "height", "full_sensor_height"
     )
+    size: tuple[fields.Pixels, fields.Pixels] | None = fields.keys("imageSize", "image_size")
     name: str | None = fields.keys("camera_name")
     names: list[str] | str | None = fields.keys("camera_names")
     """OpenCV's XML has no other way to write a list of one than its text."""
@@ -83,7 +84,8 @@ class CameraKeys(fields.FileModel):
             raise CalibrationError(f"{where}lacks camera_matrix: is it a calibration?")
         if k is not None and len(k) == 4 and self.model is None and reading.lens is None:
             warn(f"{where}4 coefficients taken for k1 k2 p1 p2: a fisheye needs --lens fisheye")
-        size = (self.width, self.height) if self.width and self.height else reading.size(path)
+        size = self.size or (self.width or 0, self.height or 0)
+        size = size if all(size) else reading.size(path)
         return camera_of_matrix(f"{where}camera_matrix", self.matrix, k, size, LENS_NAMES[name])
 
 

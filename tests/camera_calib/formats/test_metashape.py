@@ -25,6 +25,7 @@ from tests.strategies_formats import (
 SAMPLE = (DATA / "metashape.xml").read_text()
 SENSOR = """<sensor id="{id}" label="{label}" type="{kind}"><resolution width="4000" height="3000"/>
 <property name="pixel_width" value="0.0016"/>
+<calibration type="{kind}" class="initial"><f>1</f></calibration>
 <calibration type="{kind}" class="adjusted"><resolution width="4000" height="3000"/><f>2000</f>
 <cx>3</cx><k1>0.02</k1><k4>{k4}</k4></calibration></sensor>
 """

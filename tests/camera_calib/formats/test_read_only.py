@@ -78,6 +78,7 @@ READ: list[tuple[str, str, list[Project]]] = [
     ("orbslam", "orbslam_stereo.yaml", [BROWN, BROWN]),
     ("zed", "SN1.conf", [BROWN, BROWN]),
     ("metashape", "photoscan_2015.xml", [BROWN]),
+    ("opencv", "python.json", [BROWN]),
     ("opencv", "python.yaml", [partial(pinhole, (0.1, 0.0, 0.0, 0.0, 0.0))]),
 ]
 
