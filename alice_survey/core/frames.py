@@ -4,6 +4,8 @@ World `ned` is local North-East-Down with its origin at the datum on the sea sur
 forward-right-down; `cam` is right-down-forward. `a_from_b` takes coordinates in b to a.
 """
 
+import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -11,6 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
+
+from alice_survey.core.contents import as_line
+from alice_survey.core.errors import warn
 
 Array = NDArray[np.float64]
 
@@ -144,3 +149,69 @@ def pose_from_json(data: dict[str, list[float]]) -> RigidTransform:
         np.asarray(data["translation_m"], dtype=np.float64),
         Rotation.from_quat(np.asarray(data["quaternion_xyzw"], dtype=np.float64)),
     )
+
+
+SYSTEM = re.compile(r"\s*(EPSG:|\+proj|WGS84\b)", re.IGNORECASE)
+"""How the line begins that names the coordinate system of a file of OpenDroneMap."""
+_UTM = re.compile(r"WGS84\s+UTM\s+(\d{1,2})\s*([NS])", re.IGNORECASE)
+_POLE_DEG, _BEYOND_DEG = 90.0, 1.0
+"""A coordinate system is used so far beyond its own area of use, of neighbouring zones."""
+
+
+def degrees_from(system: str) -> Callable[[float, float], tuple[float, float]] | None:
+    """Latitude and longitude of x (easting or longitude) and y in a coordinate system.
+
+    The first place outside of where the system is used is named in a warning.
+
+    Args:
+        system: its name as pyproj takes it, or OpenDroneMap's such as `WGS84 UTM 16N`.
+
+    Returns:
+        None of a local grid.
+
+    Raises:
+        ValueError: it is no coordinate system; of a place, that it is beyond it.
+    """
+    from pyproj import CRS, Transformer
+    from pyproj.exceptions import CRSError, ProjError
+
+    if (utm := _UTM.match(system)) is not None:
+        system = f"EPSG:{(32700 if utm[2].upper() == 'S' else 32600) + int(utm[1])}"
+    try:
+        crs = CRS.from_user_input(system)
+    except CRSError:
+        zone = re.search(r"UTM\s*(\d{1,2})\s*([C-X])?", system, re.IGNORECASE)
+        number, north = (int(zone[1]), (zone[2] or "N").upper() >= "N") if zone else (0, True)
+        hint = f"; EPSG:{(32600 if north else 32700) + number}?" if zone else ""
+        raise ValueError(
+            f"{as_line(system)!r} is no coordinate system that is known{hint}"
+        ) from None
+    if crs.is_engineering:
+        return None
+    to_wgs84 = Transformer.from_crs(crs.to_2d(), 4326, always_xy=True)
+    area, outside = crs.area_of_use, list[tuple[float, float]]()
+
+    def degrees(x: float, y: float) -> tuple[float, float]:
+        try:
+            longitude, latitude = to_wgs84.transform(x, y, errcheck=True)
+        except ProjError:
+            raise ValueError(f"{x}, {y} is not a place in {as_line(crs.name)}") from None
+        if not abs(latitude) <= _POLE_DEG:
+            raise ValueError(f"latitude {latitude:g}: are latitude and longitude exchanged?")
+        if area is not None and not outside and _is_beyond(area, latitude, longitude):
+            outside.append((x, y))
+            warn(
+                f"{x:.10g}, {y:.10g} is latitude {latitude:.4f}, longitude {longitude:.4f}, "
+                f"outside of where {as_line(crs.name)} is used ({area.south:g} to {area.north:g}, "
+                f"{area.west:g} to {area.east:g}): check its zone, and whether it is north or south"
+            )
+        return float(latitude), float(longitude)
+
+    return degrees
+
+
+def _is_beyond(area: Any, latitude_deg: float, longitude_deg: float) -> bool:
+    """Whether a place lies outside of pyproj's area of use, which may cross the antimeridian."""
+    width = ((area.east - area.west) % 360.0 or 360.0) + 2.0 * _BEYOND_DEG
+    off = max(area.south - latitude_deg, latitude_deg - area.north)
+    return bool(off > _BEYOND_DEG or (longitude_deg - area.west + _BEYOND_DEG) % 360.0 > width)

@@ -5,7 +5,7 @@ import itertools
 import math
 import re
 from array import array
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta, tzinfo
 from pathlib import Path
@@ -16,7 +16,7 @@ import numpy as np
 from alice_survey.core.artefacts import stream_csv
 from alice_survey.core.contents import as_line, is_nowhere, is_unknown, parse_number
 from alice_survey.core.errors import NavigationError, warn
-from alice_survey.core.frames import Array
+from alice_survey.core.frames import SYSTEM, Array, degrees_from
 from missions.values.navigation import COLUMNS
 
 POSITION, READINGS = COLUMNS[:3], COLUMNS[:7]
@@ -223,6 +223,49 @@ def _bare(name: str) -> str:
     return re.sub(r"_(degrees|deg|m)$", "", re.sub(r"[\s-]+", "_", name))
 
 
+Rows = Iterator[tuple[int, dict[str, str]]]
+_ODM = (
+    IMAGE, "longitude_deg", "latitude_deg", "z/altitude", "heading_deg", "pitch_deg", "roll_deg",
+    "sigma_horizontal_m", "sigma_depth_m", "what follows",
+)  # fmt: skip
+
+
+def _rows_of_odm(path: Path, system: str, rows: Rows) -> tuple[list[str], Rows]:
+    """Columns and rows of OpenDroneMap's `geo.txt`, whose header is its coordinate system.
+
+    Its rows are `image x y [z] [yaw pitch roll] [accuracies of x and y, of z] [...]`; angles and
+    accuracies of 0 are unknown.
+    """
+    try:
+        degrees = degrees_from(system)
+    except ValueError as error:
+        raise NavigationError(f"{path}: {error}") from None
+    if degrees is None:
+        raise NavigationError(f"{path}: is of a local grid: latitudes and longitudes are needed")
+    split = [(line, row[system].split()) for line, row in rows]
+    split = [(line, cells) for line, cells in split if cells and not cells[0].startswith("#")]
+    longest = max((len(cells) for _, cells in split), default=0)
+    known = next((count for count in (9, 7) if longest >= count), 4)
+    names = [*_ODM[:known], *(_ODM[-1:] if longest > known else ())]
+
+    def table() -> Rows:
+        for line, cells in split:
+            row = dict(itertools.zip_longest(names, cells[: len(names)], fillvalue=""))
+            x, y = row["longitude_deg"], row["latitude_deg"]
+            try:
+                at = parse_number(x), parse_number(y)
+                place: tuple[object, ...] = at if is_nowhere(*at) else degrees(*at)
+            except ValueError:  # the reader names it
+                place = f"{x}, {y}", ""
+            row["latitude_deg"], row["longitude_deg"] = map(str, place)
+            unknown = [name for name in names[7:9] if not row[name].strip("0.")]
+            if not any(row[name].strip("0.") for name in names[4:7]):
+                unknown += names[4:7]
+            yield line, row | dict.fromkeys(unknown, "")
+
+    return names, table()
+
+
 def read_navigation(
     path: Path,
     zone: tzinfo,
@@ -233,9 +276,10 @@ def read_navigation(
 ) -> NavigationLog:
     """Read a navigation CSV: `time_s` or `time_utc`, what is needed, and any other of `COLUMNS`.
 
-    Usual names of other programs serve too. A row without a finite time or a needed value, or whose
-    time does not follow the row before, is left out with a warning that names its line; of any
-    other value only the value is left out. What stands for "unknown" is no value.
+    Usual names of other programs serve too, and so does OpenDroneMap's `geo.txt`. A row without a
+    finite time or a needed value, or whose time does not follow the row before, is left out with a
+    warning that names its line; of any other value only the value is left out. What stands for
+    "unknown" is no value.
 
     Args:
         path: the file.
@@ -248,6 +292,8 @@ def read_navigation(
         NavigationError: the file cannot be read, lacks a column, or holds no usable row.
     """
     header, rows = stream_csv(path)
+    if SYSTEM.match(header[0]) and len(header) == 1:
+        header, rows = _rows_of_odm(path, header[0], rows)
     if is_growing:
         rows = (row for row, _ in itertools.pairwise(rows))
     at = _usual_columns(path, header, by_picture=by_picture)

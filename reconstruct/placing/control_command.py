@@ -17,7 +17,6 @@ Control of other programs becomes `control.csv` and `picks.csv`:
 """
 
 import math
-import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -33,7 +32,7 @@ from alice_survey.core.artefacts import need_stage, write_csv
 from alice_survey.core.contents import as_line, one_line, ordinary_file, xml_root
 from alice_survey.core.errors import ReconstructionError, WorkspaceError, warn, why
 from alice_survey.core.executor import SERIAL, Executor
-from alice_survey.core.frames import Array, distances_m
+from alice_survey.core.frames import SYSTEM, Array, distances_m
 from alice_survey.core.manifest import ImageRecord, read_manifest
 from alice_survey.core.records import MappingRecord, RegistrationRecord, ScaleRecord
 from reconstruct.pictures.files import list_names, read_header, safe_name
@@ -345,8 +344,6 @@ def _finite(element: ET.Element, key: str, name: str) -> float:
     return value
 
 
-_UTM = re.compile(r"WGS84\s+UTM\s+(\d{1,2})\s*([NS])", re.IGNORECASE)
-_SYSTEM = re.compile(r"\s*(EPSG:|\+proj|WGS84\b)", re.IGNORECASE)
 _MIN_FIELDS = 6
 _CHECK = "CHK-"
 """How the names of ODM's check points begin."""
@@ -364,9 +361,6 @@ def read_gcp_list(text: str) -> ForeignControl:
         if line.strip() and not line.lstrip().startswith("#")
     ]
     (_, system), *rows = lines
-    utm = _UTM.match(system)
-    if utm is not None:
-        system = f"EPSG:{(32700 if utm[2].upper() == 'S' else 32600) + int(utm[1])}"
     place_of = coordinates(system)
     points: dict[str, KnownPoint] = {}
     names: dict[tuple[float, ...], str] = {}
@@ -566,7 +560,7 @@ def read_foreign(path: Path) -> ForeignControl:
         raise WorkspaceError(f"{path}: cannot be read: {why(error)}") from None
     if text.lstrip().startswith("<") and "<markers" in text:
         read = read_markers
-    elif _SYSTEM.match(text):
+    elif SYSTEM.match(text):
         read = read_gcp_list
     else:
         raise WorkspaceError(

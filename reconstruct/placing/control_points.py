@@ -34,7 +34,6 @@ matches alone says how well they agree; the covariance of the point holds both (
 import csv
 import io
 import math
-import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -55,7 +54,7 @@ from alice_survey.core.artefacts import (
 )
 from alice_survey.core.contents import as_line, is_nowhere, is_unknown, parse_number
 from alice_survey.core.errors import WorkspaceError, warn, why
-from alice_survey.core.frames import Array, Datum
+from alice_survey.core.frames import Array, Datum, degrees_from
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from camera_calib.triangulate import nearest_to_rays
 from reconstruct.stages import CONTROL_FILES
@@ -305,63 +304,28 @@ def _point(row: dict[str, str], name: str, use: Use, sigma: float) -> KnownPoint
     return point
 
 
-_POLE_DEG, _BEYOND_DEG = 90.0, 1.0
-"""A coordinate system is used so far beyond its own area of use, of neighbouring zones."""
 PlaceOf = Callable[[float, float], KnownPoint]
 """A nameless point from x (easting or longitude) and y in the coordinates of a file."""
 
 
 @lru_cache(maxsize=8)
 def coordinates(system: str) -> PlaceOf:
-    """Coordinates of a file from the name of their system: what pyproj takes.
+    """Coordinates of a file from the name of their system, as `degrees_from` takes it.
 
     The first place outside of where the system is used is named in a warning.
 
     Raises:
         ValueError: it is no coordinate system; of a place, that it is beyond it.
     """
-    from pyproj import CRS, Transformer
-    from pyproj.exceptions import CRSError, ProjError
-
-    try:
-        crs = CRS.from_user_input(system)
-    except CRSError:
-        zone = re.search(r"UTM\s*(\d{1,2})\s*([C-X])?", system, re.IGNORECASE)
-        number, north = (int(zone[1]), (zone[2] or "N").upper() >= "N") if zone else (0, True)
-        hint = f"; EPSG:{(32600 if north else 32700) + number}?" if zone else ""
-        raise ValueError(
-            f"{as_line(system)!r} is no coordinate system that is known{hint}"
-        ) from None
-    if crs.is_engineering:  # a local grid, metres
+    degrees = degrees_from(system)
+    if degrees is None:  # a local grid, metres
         return lambda x, y: KnownPoint(name="", north_m=y, east_m=x)
-    to_wgs84 = Transformer.from_crs(crs.to_2d(), 4326, always_xy=True)
-    area, outside = crs.area_of_use, list[KnownPoint]()
 
     def place(x: float, y: float) -> KnownPoint:
-        try:
-            longitude, latitude = to_wgs84.transform(x, y, errcheck=True)
-        except ProjError:
-            raise ValueError(f"{x}, {y} is not a place in {as_line(crs.name)}") from None
-        if not abs(latitude) <= _POLE_DEG:
-            raise ValueError(f"latitude {latitude:g}: are latitude and longitude exchanged?")
-        found = KnownPoint(name="", latitude_deg=float(latitude), longitude_deg=float(longitude))
-        if area is not None and not outside and _is_beyond(area, latitude, longitude):
-            outside.append(found)
-            warn(
-                f"{x:.10g}, {y:.10g} is latitude {latitude:.4f}, longitude {longitude:.4f}, "
-                f"outside of where {as_line(crs.name)} is used ({area.south:g} to {area.north:g}, "
-                f"{area.west:g} to {area.east:g}): check its zone, and whether it is north or south"
-            )
-        return found
+        latitude, longitude = degrees(x, y)
+        return KnownPoint(name="", latitude_deg=latitude, longitude_deg=longitude)
 
     return place
-
-
-def _is_beyond(area: Any, latitude_deg: float, longitude_deg: float) -> bool:
-    """Whether a place lies outside of pyproj's area of use, which may cross the antimeridian."""
-    width = ((area.east - area.west) % 360.0 or 360.0) + 2.0 * _BEYOND_DEG
-    off = max(area.south - latitude_deg, latitude_deg - area.north)
-    return bool(off > _BEYOND_DEG or (longitude_deg - area.west + _BEYOND_DEG) % 360.0 > width)
 
 
 def read_number(text: str, name: str) -> float:

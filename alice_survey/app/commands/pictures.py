@@ -55,7 +55,9 @@ class ImportImagesCommand(WorkspaceCommand, ThreadsCommand):
     )
     every: float | None = option(None, "Seconds between frames, at a fixed step.", ge=0.01)
     recursive: bool = option(False, "Also take folders inside.")
-    navigation: Path | None = option(None, "CSV: time, position, ...", metavar="FILE")
+    navigation: Path | None = option(
+        None, "CSV: time or image, position, ...; or ODM's geo.txt.", metavar="FILE"
+    )
     clock_offset: float = option(0.0, "Seconds to add to picture times.")
     time_zone: str = option("UTC", "Of times that name none.")
     vertical_datum: str | None = option(None, "What the CSV's depths count from.", metavar="NAME")

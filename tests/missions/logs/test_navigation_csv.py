@@ -231,3 +231,44 @@ def test_positions_by_the_names_of_pictures(tmp_path: Path) -> None:
     with refused(NavigationError, "second row"):
         rows = [*rows, "img_2.png,1,1,1,1"]
         read_navigation(log_file(tmp_path, *rows, header=header), UTC, (), by_picture=True)
+
+
+@pytest.mark.parametrize(
+    ("system", "x", "y"),
+    [
+        ("EPSG:4326", 34.955, 32.8236), ("WGS84 UTM 36N", 683005.264, 3633424.290),
+        ("+proj=utm +zone=36 +datum=WGS84 +units=m +no_defs", 683005.264, 3633424.290),
+    ],
+)  # fmt: skip
+def test_geo_txt_of_open_drone_map(tmp_path: Path, system: str, x: float, y: float) -> None:
+    """Heights are up; angles and accuracies of 0 are unknown, and so is a place of 0, 0."""
+    rows = [
+        f"A.JPG {x} {y} -5.5 350 2 1 0.5 0.2", f"b.jpg\t{x} {y} -6 0 0 0 3.0 0",
+        "# a comment", "", "c.jpg 0 0 -7 0 0 0 0 0", "D.JPG north 2 -8 10 0 0 0 0",
+    ]  # fmt: skip
+    log = read_navigation(log_file(tmp_path, *rows, header=system), UTC, (), by_picture=True)
+    found = log.of_pictures(["in/a.png", "B.jpg", "c.jpg", "d.jpg"])[1]
+    expected = {
+        "latitude_deg": [32.8236, 32.8236, np.nan, np.nan],
+        "longitude_deg": [34.955, 34.955, np.nan, np.nan], "depth_m": [5.5, 6, 7, 8],
+        "heading_deg": [350, np.nan, np.nan, 10], "roll_deg": [1, np.nan, np.nan, 0],
+        "sigma_horizontal_m": [0.5, 3, np.nan, np.nan],
+        "sigma_depth_m": [0.2, np.nan, np.nan, np.nan],
+    }  # fmt: skip
+    for name, values in expected.items():
+        np.testing.assert_allclose(found[name], values, atol=1e-7)
+
+
+def test_geo_txt_says_what_is_not_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = log_file(tmp_path, "a.jpg 5 60 -3 0.02 0.05", header="EPSG:4326")
+    log = read_navigation(path, UTC, (), by_picture=True)
+    assert {*log.columns} == {"latitude_deg", "longitude_deg", "depth_m"}
+    assert "not read" in capsys.readouterr().err
+    for header, named in (
+        ("EPSG:1", "EPSG:1"),
+        ('LOCAL_CS["site"]', "time_s"),
+        ("EPSG:4326", "reading"),
+    ):
+        with refused(NavigationError, named):
+            rows = ["a.jpg 5"] if header == "EPSG:4326" else ["a.jpg 5 60 -3"]
+            read_navigation(log_file(tmp_path, *rows, header=header), UTC, (), by_picture=True)

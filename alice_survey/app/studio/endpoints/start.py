@@ -26,7 +26,7 @@ from reconstruct.pictures.importing import cameras_in, preview_import
 
 _MAX_FOLDERS = 500
 _MAX_ENTRIES = 20_000
-_CHOSEN = (".csv", ".json")
+_CHOSEN = (".csv", ".json", ".txt")
 """Endings of files that a person may choose next to their pictures."""
 
 
@@ -52,7 +52,7 @@ class Listing:
     """The folder that it lies in, if that may be listed."""
     inside: Sequence[Folder]
     files: Sequence[str]
-    """Paths of CSV and JSON files: logs and calibrations."""
+    """Paths of CSV, JSON and text files: logs and calibrations."""
 
 
 class Folders:
