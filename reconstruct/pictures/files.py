@@ -45,7 +45,8 @@ ADVICE = {
     IN_FOLDERS: "take them with --recursive, or give these folders too",
     "other files": "their names are not those of pictures",
 }
-_GPS, _EXIF, _FOCAL_35 = 0x8825, 0x8769, 0xA405
+_GPS, _EXIF, _FOCAL, _FOCAL_35 = 0x8825, 0x8769, 0x920A, 0xA405
+_MAX_FOCAL_MM = 2000.0
 _MAKE, _MODEL, _SERIAL, _ORIENTATION = 0x010F, 0x0110, 0xA431, 0x0112
 _MIRRORED = (2, 4, 5, 7)
 """EXIF orientations of mirror images, which no lens projects."""
@@ -62,7 +63,7 @@ class PictureFacts:
     highest: int = 255
     """Largest value of any pixel; above 255 in a picture of 16 bits."""
     device: str = ""
-    """Make, model and serial number of the camera, as far as EXIF states them."""
+    """Make, model, serial number and focal length of the camera, as far as EXIF states them."""
     orientation: int = 1
     """As EXIF states it; pixels are used as they are stored."""
     time_local: datetime | None = None
@@ -296,14 +297,27 @@ def _with_exif(facts: PictureFacts) -> PictureFacts:
 
 
 def _device(exif: Any) -> str:
-    """Make, model and serial number; the make only where the model does not start with it."""
+    """Make, model and serial number; the make only where the model does not start with it.
+
+    Then the focal length, of the lens and on 35 mm film: a zoom is another lens.
+    """
     details = exif.get_ifd(_EXIF)
     make, model, serial = (
         "".join(c for c in str(value or "") if c.isprintable()).strip()[:_MAX_DEVICE]
         for value in (exif.get(_MAKE), exif.get(_MODEL), details.get(_SERIAL))
     )
     words = [model if model.lower().startswith(make.lower()) else f"{make} {model}"]
-    return " ".join([*words, *([f"#{serial}"] if serial else [])]).strip()
+    body = " ".join([*words, *([f"#{serial}"] if serial else [])]).strip()
+    focal, film = _number(details.get(_FOCAL)), _film_mm(details)
+    lens = [f"{focal:.3g} mm"] if 0 < focal < _MAX_FOCAL_MM else []
+    lens += [f"({film:.3g} mm on film)"] if film > 0 else []
+    return ", ".join(filter(None, [body, " ".join(lens)]))
+
+
+def _film_mm(details: Any) -> float:
+    """Focal length on film of 35 mm; NaN where EXIF states none that is one."""
+    stated = _number(details.get(_FOCAL_35))
+    return stated if 5 <= stated <= 1000 else math.nan
 
 
 def _number(value: Any) -> float:
@@ -338,12 +352,10 @@ def exif_focal_px(path: Path, width_px: int, height_px: int) -> float:
     """
     try:
         with _pillow(path) as image:
-            stated = _number(image.getexif().get_ifd(_EXIF).get(_FOCAL_35))
+            film = _film_mm(image.getexif().get_ifd(_EXIF))
     except ImageError:
         return float("nan")
-    if not 5 <= stated <= 1000:
-        return float("nan")
-    return stated / 36.0 * max(width_px, height_px)
+    return film / 36.0 * max(width_px, height_px)
 
 
 def to_utc(time: datetime, zone: tzinfo) -> datetime:

@@ -548,6 +548,12 @@ def check_entries(entries: Sequence[Incoming], rig: Rig | None) -> None:
                 f"{one.path.name} of the same camera has {one.width_px} x {one.height_px}: import "
                 "pictures of one size only"
             )
+    for name in first:
+        lenses = {entry.facts.device for entry in entries if entry.camera == name}
+        if len(lenses) > 1:
+            which = list_names([lens or "one without EXIF" for lens in sorted(lenses)], 3)
+            warn(f"pictures of {name} are of {len(lenses)} cameras or zooms, which are taken for "
+                 f"one lens: {which}")  # fmt: skip
     if rig is not None:
         check_rig({n: (e.facts.width_px, e.facts.height_px) for n, e in first.items()}, rig)
 

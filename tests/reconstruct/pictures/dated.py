@@ -13,7 +13,7 @@ from reconstruct.pictures.importing import ImportRecord, Preview
 
 BEGAN = datetime(2024, 7, 1, 12, 0, 0)
 TAGS = {"orientation": 0x112, "make": 0x10F, "model": 0x110}
-DETAILS = {"serial": 0xA431, "taken": 0x9003, "fraction": 0x9291, "focal": 0xA405}
+DETAILS = {"serial": 0xA431, "taken": 0x9003, "fraction": 0x9291, "focal": 0xA405, "lens": 0x920A}
 
 
 def noise(*seed: int, size: tuple[int, int] = (64, 48)) -> np.ndarray:

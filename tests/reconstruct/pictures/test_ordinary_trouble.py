@@ -11,7 +11,7 @@ from alice_survey.core.artefacts import read_json
 from alice_survey.core.errors import ImageError, keep_warnings
 from alice_survey.core.manifest import read_manifest
 from reconstruct.pictures.files import decode, exif_focal_px, inspect
-from reconstruct.pictures.importing import import_images
+from reconstruct.pictures.importing import import_images, preview_import
 from reconstruct.pictures.undistorted import read_colour
 from tests.reconstruct.pictures.dated import counts, reasons, rows_of, save, table, take
 
@@ -82,6 +82,21 @@ def test_cameras_of_a_mixed_folder_are_told_apart_by_exif_and_size(tmp_path: Pat
     images = tmp_path / "w" / "images"
     assert all(r.camera == r.image.split("/")[0] for r in rows_of(tmp_path / "w"))
     assert read_json(images / "survey.json")["notes"][-4:] == found.lines
+
+
+def test_zooms_of_one_camera_are_several_lenses(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Also a crop by which the focal length on film alone changes; 0 and 1 are unknown."""
+    for number, (lens, film) in enumerate([(4.5, 25), (6.3, 35), (4.5, 0), (4.5, 50), (0, 1)] * 2):
+        tags = {"model": "TG-6", "lens": lens, "focal": film}
+        save(tmp_path / "in" / f"{number}.jpg", smooth(number), **tags)
+    found = import_images(tmp_path / "w", [tmp_path / "in"])
+    names = ["camera", *(f"camera-{n}" for n in range(2, 6))]
+    assert counts(found) == counts(preview_import([tmp_path / "in"])) == dict.fromkeys(names, 2)
+    assert capsys.readouterr().err.count("one lens") == 0
+    import_images(tmp_path / "v", [], cameras={"down": tmp_path / "in"})
+    assert "down are of 5 cameras" in capsys.readouterr().err
 
 
 def test_copies_are_left_out_and_named(tmp_path: Path) -> None:
