@@ -3,11 +3,14 @@
 Nothing here imports the modules that do the work: they are named, and loaded when a stage is made.
 """
 
+import hashlib
+import json
 import math
+from collections.abc import Collection
 from pathlib import Path
 
 from alice_survey.core import records
-from alice_survey.core.artefacts import read_stage
+from alice_survey.core.artefacts import read_csv, read_stage
 from alice_survey.core.errors import WorkspaceError
 from alice_survey.core.manifest import read_manifest
 from alice_survey.core.products import listed_in
@@ -54,8 +57,29 @@ def _mapping_shortfall(folder: Path) -> str:
 
 
 def _placing_inputs(workspace: Path) -> list[Path]:
-    known = _existing(*(workspace / name for name in (SCALE_FILE, *CONTROL_FILES)))
+    known = _existing(workspace / SCALE_FILE, workspace / CONTROL_FILES[0])
     return [workspace / "mapping", *_about_pictures(workspace), *known]
+
+
+def controls(point: str, known: Collection[str]) -> bool:
+    """Whether a picked point, or the marker that it is a corner of, is a known one, by names."""
+    return point in known or point.rpartition(".")[0] in known
+
+
+def _picks_of_control(workspace: Path) -> dict[str, str]:
+    """Digest of the picks of points in `control.csv`: all others change nothing."""
+    control, *tables = (workspace / name for name in CONTROL_FILES)
+    rows = read_csv(control, fault=WorkspaceError)[1] if control.is_file() else ()
+    meant = [row for _, row in rows if not next(iter(row.values()), "").startswith("# ")]
+    known = {row.get(key, "") for row in meant for key in ("name", "from", "to")} - {""}
+    picks = [
+        [row.get(key, "") for key in ("image", "point", "x", "y", "sigma_px", "matched_to")]
+        for path in (_existing(*tables) if known else ())
+        for _, row in read_csv(path, fault=WorkspaceError)[1]
+        if controls(row.get("point", ""), known) and (row.get("x") or row.get("y"))
+    ]
+    digest = hashlib.blake2b(json.dumps(picks).encode(), digest_size=16).hexdigest()
+    return {"picks": digest} if picks else {}
 
 
 def _placing_summary(folder: Path) -> Summary:
@@ -197,6 +221,7 @@ PLACING = StageSpec(
         "index_sigma": "water.index_sigma",
     },
     inputs=_placing_inputs,
+    content=_picks_of_control,
     summary=_placing_summary,
     products={"track.csv": "camera track with sigmas", "model": "COLMAP model"},
     reported=(".",),

@@ -62,6 +62,8 @@ class StageSpec:
     """Dotted names of the settings that are files, or lists of files."""
     inputs: Callable[[Path], Sequence[Path]] = lambda workspace: ()
     """All files of a workspace that the result depends on."""
+    content: Callable[[Path], Mapping[str, Any]] = lambda workspace: {}
+    """What else of a workspace it depends on, where that is not whole files; as JSON values."""
     resumes: bool = False
     """Work resumes from what an interrupted run of the same digest left."""
     simulated: bool = False
@@ -76,7 +78,7 @@ class StageSpec:
         return Stage(
             name=self.folder,
             version=self.version,
-            settings=settings_of(self.settings, config),
+            settings=settings_of(self.settings, config) | dict(self.content(workspace)),
             inputs=[*self.inputs(workspace), *files_of(self.setting_files, config)],
             resumes=self.resumes,
             command=self.command,

@@ -65,7 +65,7 @@ from reconstruct.placing.fit import (
 )
 from reconstruct.placing.navigation import PLACE, SCALE, Installation, body_from_pinhole
 from reconstruct.placing.track import picture_modes
-from reconstruct.stages import SCALE_FILE
+from reconstruct.stages import SCALE_FILE, controls
 from reconstruct.views.model import MEAN_PLANE, WorldFrame
 
 _BEAM = np.tan(np.deg2rad(15.0))
@@ -470,21 +470,23 @@ def _local_note(records: Sequence[ImageRecord], *, headed: bool) -> str:
     return f"no latitude and longitude: {measured} by navigation, {own} the model's own; no CRS"
 
 
-def picks_of_model(workspace: Path, images: Collection[str]) -> list[Pick]:
-    """Picks in the pictures of a model; what else is picked is named.
+def picks_of_model(workspace: Path, images: Collection[str], known: Collection[str]) -> list[Pick]:
+    """Picks of known points in the pictures of a model; what else of them is picked is named.
 
     Args:
         workspace: with `picks.csv` and `markers.csv`, or without.
         images: names of the pictures.
+        known: names of the points and markers.
 
     Raises:
         WorkspaceError: a file is wrong, or nothing is picked in the model.
     """
     files = [workspace / name for name in (PICKS_FILE, MARKERS_FILE)]
-    picks = [pick for path in files if path.is_file() for pick in read_picks(path)]
+    read = (pick for path in files if path.is_file() for pick in read_picks(path))
+    picks = [pick for pick in read if controls(pick.point, known)]
     if not picks:
         warn(
-            f"{CONTROL_FILE} is not used: no point is picked in {PICKS_FILE} or {MARKERS_FILE}: "
+            f"{CONTROL_FILE} is not used: no point of it is picked in {PICKS_FILE} or {MARKERS_FILE}: "
             "mark them in the studio's tab Pictures, or find markers with 'alice-survey control'"
         )
     strange = sorted({pick.image for pick in picks} - set(images))
@@ -501,16 +503,17 @@ def _tie(task: Placing, control: Control, datum: Datum | None) -> ControlFit:
     """Find the known points in the pictures."""
     if not (control.points or control.lengths):
         return ControlFit(ties=(), bars=(), lost={})
-    picks = picks_of_model(task.workspace, {record.image for record in task.records})
+    requested = {p.name for p in control.points} | {
+        end for length in control.lengths for end in length.ends or ()
+    }
+    known = requested | {length.name for length in control.lengths}
+    picks = picks_of_model(task.workspace, {record.image for record in task.records}, known)
     warps = task.adjusted.mapped.warps
     cameras = {
         record.image: RegisteredPicture(warp=warps[record.camera], model_from_pinhole=pose)
         for record, pose in zip(task.records, task.pinholes, strict=True)
     }
     picked, lost = triangulate_picks(picks, cameras)
-    requested = {p.name for p in control.points} | {
-        end for length in control.lengths for end in length.ends or ()
-    }
     lost = {name: why for name, why in lost.items() if name in requested}
     found = tie_control(control, picked, lost, datum)
     shape = task.adjusted.shape

@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.artefacts import write_json
-from alice_survey.core.config import CameraConfig, WaterConfig
+from alice_survey.core.config import CameraConfig, SurveyConfig, WaterConfig
 from alice_survey.core.errors import keep_warnings
 from alice_survey.core.frames import Array
 from alice_survey.core.manifest import write_manifest
@@ -39,6 +39,8 @@ from reconstruct.placing.control_points import (
 )
 from reconstruct.placing.fit import PlacementFit, fit_control, fit_navigation
 from reconstruct.placing.navigation import body_from_pinhole
+from reconstruct.placing.place import picks_of_model
+from reconstruct.stages import PLACING
 from tests.oracles_place import is_unit
 from tests.reconstruct.scenes import ALTITUDE_M, DATUM, Scene, make_scene
 
@@ -535,3 +537,31 @@ def test_markers_of_another_dictionary_are_not_seen(workspace: Path) -> None:
     _, found = survey_control(workspace, dictionary="DICT_7X7_100")
     assert found["detections"] == 0
     assert read_picks(workspace / "markers.csv") == []
+
+
+def test_what_controls_nothing_is_no_input(tmp_path: Path) -> None:
+    """A pick without control, or of a point that it does not name, makes no placing stale."""
+
+    def depends() -> tuple[dict[str, object], list[Path]]:
+        stage = PLACING.stage(tmp_path, config)
+        return dict(stage.settings), [p for p in stage.inputs if p.suffix == ".csv"]
+
+    config = SurveyConfig()
+    header = "image,point,x,y,sigma_px,remark"
+    rows = [f"{n}.png,{p},{n}5,7,1," for p in ("a", "b", "7.0", "8.0") for n in range(2)]
+    before = depends()
+    assert not any("picks" in name for name in before[0])
+    picks = tmp_path / "picks.csv"
+    picks.write_text("\n".join([header, *rows]))
+    assert depends() == before and picks_of_model(tmp_path, ["0.png"], ()) == []
+    (tmp_path / "control.csv").write_text(
+        "kind,name,use,length_m,sigma_m\nmarker,7,check,0.1,0.001\n# point,8,control,,"
+    )
+    known = depends()
+    assert {p.name for p in {*known[1]} - {*before[1]}} == {"control.csv"}
+    assert [p.point for p in picks_of_model(tmp_path, ["0.png"], {"7"})] == ["7.0"]
+    rows = [f"{rows[0]}mine", *rows[1:6], "1.png,c,1,1,1,", "0.png,7.1,,,,"]
+    picks.write_text("\n".join([header, *rows]))
+    assert depends() == known
+    picks.write_text("\n".join([header, *rows, "0.png,7.1,4,4,1,"]))
+    assert depends() != known
