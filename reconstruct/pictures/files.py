@@ -203,6 +203,52 @@ def inspect(path: Path) -> PictureFacts:
     return facts
 
 
+def inspect_shot(paths: Sequence[Path]) -> list[PictureFacts]:
+    """What the files of one shot hold, up to the first that can be used."""
+    tried: list[PictureFacts] = []
+    for path in paths:
+        if not tried or tried[-1].fault:
+            tried.append(inspect(path))
+    return tried
+
+
+def same_shots(pictures: Sequence[Path]) -> list[list[Path]]:
+    """Files of one shot that are of several kinds, the one to take first.
+
+    They have one name and one time by EXIF; where one states no time they are of one folder. A file
+    that states its time is taken, and of these the RAW, else that of most pixels, else no JPEG.
+    """
+    named: dict[str, list[Path]] = {}
+    for path in pictures:
+        named.setdefault(path.stem.lower(), []).append(path)
+    shots: list[list[PictureFacts]] = []
+    for some in named.values():
+        own: list[list[PictureFacts]] = []
+        headers = map(read_header, some) if len({kind_of(path) for path in some}) > 1 else ()
+        for one in sorted(headers, key=_preference, reverse=True):
+            shot = next((s for s in own if all(_is_one_shot(one, other) for other in s)), None)
+            if shot is None:
+                own.append([one])
+            else:
+                shot.append(one)
+        shots += own
+    return [[facts.path for facts in shot] for shot in shots if len(shot) > 1]
+
+
+def _preference(facts: PictureFacts) -> tuple[float, ...]:
+    kind, pixels = kind_of(facts.path), facts.width_px * facts.height_px
+    dated = facts.time_local is not None
+    return not facts.fault, dated, kind == "RAW", pixels, kind != "JPEG"
+
+
+def _is_one_shot(one: PictureFacts, other: PictureFacts) -> bool:
+    times = [
+        f.time_local and f.time_local.replace(microsecond=0, tzinfo=None) for f in (one, other)
+    ]
+    same = one.path.parent == other.path.parent if None in times else times[0] == times[1]
+    return same and kind_of(one.path) != kind_of(other.path)
+
+
 def read_header(path: Path) -> PictureFacts:
     """What a picture states, without decoding it; size 0 where only decoding can tell."""
     size, raw = (0, 0), path.suffix.lower() in RAW

@@ -52,6 +52,7 @@ from reconstruct.pictures.files import (
     list_names,
     look_into,
     read_header,
+    same_shots,
     to_utc,
 )
 from reconstruct.pictures.videos import (
@@ -69,6 +70,7 @@ _ADVICE = {
     incoming.UNDECODABLE: "copy them from the camera again",
     incoming.MIRRORED: "save them as they are seen, without an EXIF orientation",
     incoming.COPIES: "each file counts once",
+    incoming.SHOTS: "of each the RAW is taken, else that of most pixels, else no JPEG",
     **ADVICE,
 }
 _NAMED = 3
@@ -196,10 +198,20 @@ class ImportScan:
         """All folders."""
         return [folder for own in self.folders.values() for folder in own]
 
-    @property
+    @cached_property
+    def shots(self) -> dict[Path, list[Path]]:
+        """Other files of the same shot, by the one that is taken."""
+        every = [[p for f in own for p in f.pictures] for own in self.folders.values()]
+        return {first: others for own in every for first, *others in same_shots(own)}
+
+    @cached_property
     def pictures(self) -> dict[str, list[Path]]:
-        """Pictures by camera."""
-        return {name: [p for f in own for p in f.pictures] for name, own in self.folders.items()}
+        """Pictures by camera, one of each shot."""
+        twice = {path for others in self.shots.values() for path in others}
+        return {
+            name: [p for f in own for p in f.pictures if p not in twice]
+            for name, own in self.folders.items()
+        }
 
     @cached_property
     def recordings(self) -> list[Recording]:
@@ -358,7 +370,10 @@ def preview_import(
             )
     record = scan.record(
         rows, Counter(kind_of(path) for path in pictures), Counter(),
-        {_NO_HEADER: [one.path.name for one in facts if one.fault]},
+        {
+            _NO_HEADER: [one.path.name for one in facts if one.fault],
+            incoming.SHOTS: [p.name for others in scan.shots.values() for p in others],
+        },
     )  # fmt: skip
     return Preview(
         **dict(record) | {
@@ -521,14 +536,10 @@ def import_images(
             entries = take_frames(scan.recordings, names, partial, frame_overlap, every_s)
         else:
             if bag is None:
-                stations, taken = incoming.pair_by_time(scan.pictures, triggers, scan.zone)
+                paired = incoming.pair_by_time(scan.pictures, triggers, scan.zone)
             else:
-                stations, taken = incoming.take_bag(
-                    bag, topics, scan.mono, partial / _SCRATCH, every_s
-                )
-            entries, left_out = incoming.find_entries(stations, executor)
-            if taken:
-                entries = [incoming.with_time(entry, taken[entry.source]) for entry in entries]
+                paired = incoming.take_bag(bag, topics, scan.mono, partial / _SCRATCH, every_s)
+            entries, left_out = incoming.find_entries(paired, scan.shots, executor)
             if scan.unnamed:
                 by_key = {
                     key: name

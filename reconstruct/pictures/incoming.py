@@ -42,7 +42,7 @@ from reconstruct.pictures.files import (
     PictureFacts,
     bits_used,
     copy_picture,
-    inspect,
+    inspect_shot,
     kind_of,
     list_names,
     mask_names,
@@ -440,6 +440,7 @@ def pixels_of(message: Any) -> NDArray[Any]:
 UNDECODABLE = "cannot be decoded"
 MIRRORED = "mirror images"
 COPIES = "copies of others"
+SHOTS = "other files of a shot"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -459,36 +460,46 @@ class Incoming:
 
 
 def find_entries(
-    stations: Sequence[Mapping[str, Path]], executor: Executor
+    paired: PairedPictures, shots: Mapping[Path, Sequence[Path]], executor: Executor
 ) -> tuple[list[Incoming], dict[str, list[str]]]:
     """Pictures of all stations that can be used; the others are named in warnings.
+
+    Args:
+        paired: pictures by moment, and times of them.
+        shots: other files of the same shot, in the order in which they stand in for a picture.
+        executor: where tasks run.
 
     Returns:
         Those that can be used, and names of the others by reason.
     """
+    stations, taken = paired
     listed = [
-        (camera, station, path)
+        (camera, station, [path, *shots.get(path, ())])
         for station, paths in enumerate(stations)
         for camera, path in paths.items()
     ]
-    copies = same_bytes([path for _, _, path in listed])
-    owners = {path: camera for camera, _, path in listed}
+    owners = {path: camera for camera, _, files in listed for path in files}
+    copies = same_bytes([*owners])
     for copy, first in copies.items():
         if owners[copy] != owners[first]:
             raise ImageError(
                 f"{owners[first]} and {owners[copy]} have the same picture, {first} and {copy}: "
                 "give each camera the pictures that it took"
             )
-    listed = [one for one in listed if one[2] not in copies]
-    facts = executor.map(inspect, [path for _, _, path in listed], label="checking pictures")
+    listed = [one for one in listed if one[2][0] not in copies]
+    facts = executor.map(inspect_shot, [files for _, _, files in listed], label="checking pictures")
     entries = []
-    left_out = {COPIES: [copy.name for copy in copies], MIRRORED: [], UNDECODABLE: []}
-    for (camera, station, path), known in zip(listed, facts, strict=True):
-        if known.fault:
-            warn(f"{path} is left out: {known.fault}")
-            left_out[MIRRORED if known.width_px else UNDECODABLE].append(path.name)
-        else:
-            entries.append(Incoming(source=path, camera=camera, station=station, facts=known))
+    left_out = {COPIES: [copy.name for copy in copies], MIRRORED: [], UNDECODABLE: [], SHOTS: []}
+    for (camera, station, files), tried in zip(listed, facts, strict=True):
+        left_out[SHOTS] += [path.name for path in files[len(tried) :] if path not in copies]
+        for known in tried:
+            if known.fault:
+                warn(f"{known.path} is left out: {known.fault}")
+                reason = MIRRORED if known.width_px else UNDECODABLE
+                left_out[reason].append(known.path.name)
+                continue
+            entry = Incoming(source=known.path, camera=camera, station=station, facts=known)
+            entries.append(with_time(entry, taken[files[0]]) if taken else entry)
     return entries, left_out
 
 

@@ -486,7 +486,7 @@ def picks_of_model(workspace: Path, images: Collection[str], known: Collection[s
     picks = [pick for pick in read if controls(pick.point, known)]
     if not picks:
         warn(
-            f"{CONTROL_FILE} is not used: no point of it is picked in {PICKS_FILE} or {MARKERS_FILE}: "
+            f"{CONTROL_FILE} is not used: no point is picked in {PICKS_FILE} or {MARKERS_FILE}: "
             "mark them in the studio's tab Pictures, or find markers with 'alice-survey control'"
         )
     strange = sorted({pick.image for pick in picks} - set(images))

@@ -99,6 +99,34 @@ def test_zooms_of_one_camera_are_several_lenses(
     assert "down are of 5 cameras" in capsys.readouterr().err
 
 
+def test_one_file_of_each_shot_is_taken(tmp_path: Path) -> None:
+    """The one without losses, else the larger; the JPEG where that cannot be decoded."""
+    folder = tmp_path / "in"
+    for number in range(5):
+        tags = {"model": "TG", "taken": f"2024:07:01 12:00:0{number}"} if number else {}
+        save(folder / f"P{number}.JPG", smooth(number), **tags)
+        size = (32, 24) if number == 1 else (64, 48)
+        save(folder / f"p{number}.png", smooth(number + 9, size), **tags)
+    cut = folder / "p2.png"
+    cut.write_bytes(cut.read_bytes()[:-2000])
+    save(folder / "p3.bmp", smooth(6))
+    save(folder / "b" / "P4.webp", smooth(4, (32, 24)), **tags)
+    save(folder / "b" / "P3.jpg", smooth(7), model="TG", taken="2024:07:01 13:00:00")
+    save(folder / "b" / "P0.bmp", smooth(8))
+    expected = ["p0.png", "p0_2.png", "p1.jpg", "p2.jpg", "p3.jpg", "p3.png", "p4.png"]
+    seen = preview_import([folder], recursive=True)
+    found = import_images(tmp_path / "w", [folder], recursive=True)
+    assert sorted(Path(r.image).name.lower() for r in rows_of(tmp_path / "w")) == expected
+    assert {Path(name).stem.lower() for name in found.left_out["other files of a shot"]} == {
+        "p0", "p1", "p3", "p4",
+    }  # fmt: skip
+    assert reasons(found) == {"other files of a shot": 6, "cannot be decoded": 1}
+    assert reasons(seen) == {"other files of a shot": 7} and seen.pictures == len(expected)
+    triggers = table(tmp_path / "t.csv", "image,time_s", [(f"p{n}", n) for n in (2, 3, 4)])
+    import_images(tmp_path / "v", [folder], triggers=triggers)
+    assert [r.time_s for r in rows_of(tmp_path / "v")] == [2, 3, 4]
+
+
 def test_copies_are_left_out_and_named(tmp_path: Path) -> None:
     for number in range(3):
         path = save(tmp_path / "in" / f"{number}.png", smooth(number))
