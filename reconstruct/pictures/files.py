@@ -62,6 +62,8 @@ class PictureFacts:
     height_px: int = 0
     highest: int = 255
     """Largest value of any pixel; above 255 in a picture of 16 bits."""
+    cut_out: bool = False
+    """Whether its alpha leaves a part out, see `opaque_part`."""
     device: str = ""
     """Make, model, serial number and focal length of the camera, as far as EXIF states them."""
     orientation: int = 1
@@ -191,12 +193,16 @@ def inspect(path: Path) -> PictureFacts:
     try:
         if not path.is_file():
             return PictureFacts(path=path, fault="not a regular file")
-        pixels = decode(path)
+        stored = decode_stored(path)
     except (ImageError, OSError) as error:
         return PictureFacts(path=path, fault=str(error))
-    height, width = pixels.shape[:2]
-    highest = int(pixels.max(initial=0))
-    facts = _with_exif(PictureFacts(path=path, width_px=width, height_px=height, highest=highest))
+    height, width = stored.shape[:2]
+    facts = PictureFacts(
+        path=path, width_px=width, height_px=height,
+        highest=int(_without_alpha(stored).max(initial=0)),
+        cut_out=opaque_part(stored) is not None,
+    )  # fmt: skip
+    facts = _with_exif(facts)
     if facts.orientation in _MIRRORED:
         fault = f"a mirror image by its EXIF orientation {facts.orientation}: save it as it is seen"
         return replace(facts, fault=f"{fault}, without that tag")
@@ -261,8 +267,29 @@ def read_header(path: Path) -> PictureFacts:
     return _with_exif(PictureFacts(path=path, width_px=width, height_px=height))
 
 
+def opaque_part(stored: NDArray[Any]) -> NDArray[np.bool_] | None:
+    """(H, W) where a picture is more opaque than not; None where that is everywhere or nowhere."""
+    if stored.ndim < 3 or stored.shape[2] < 4:
+        return None
+    opaque: NDArray[np.bool_] = stored[..., 3] > np.iinfo(stored.dtype).max // 2
+    return opaque if opaque.any() and not opaque.all() else None
+
+
+def _without_alpha(stored: NDArray[Any]) -> NDArray[Any]:
+    return np.ascontiguousarray(stored[..., :3] if stored.ndim == 3 else stored)
+
+
 def decode(path: Path) -> NDArray[Any]:
     """All pixels of a picture, (H, W) or (H, W, 3) BGR, 8 or 16 bits.
+
+    Raises:
+        ImageError: it cannot be decoded to its end.
+    """
+    return _without_alpha(decode_stored(path))
+
+
+def decode_stored(path: Path) -> NDArray[Any]:
+    """All pixels of a picture as `decode` has them, with their alpha as the fourth channel.
 
     Raises:
         ImageError: it cannot be decoded to its end.
@@ -282,7 +309,7 @@ def decode(path: Path) -> NDArray[Any]:
         raise ImageError(f"holds {pixels.dtype} pixels; 8 or 16 bits can be read")
     if pixels.ndim == 3 and pixels.shape[2] not in (3, 4):
         raise ImageError(f"has {pixels.shape[2]} channels; 1, 3 or 4 can be read")
-    return np.ascontiguousarray(pixels[..., :3] if pixels.ndim == 3 else pixels)
+    return pixels
 
 
 @contextmanager
@@ -414,25 +441,37 @@ def bits_used(highest: int) -> int:
     return next(bits for bits in (8, 10, 12, 14, 16) if highest < 2**bits)
 
 
-def copy_picture(task: tuple[Path, Path, int]) -> None:
+def half_of(pixels: NDArray[Any], side: str) -> NDArray[Any]:
+    """The left or the right of two pictures side by side; of no side both."""
+    middle = pixels.shape[1] // 2
+    return {"left": pixels[:, :middle], "right": pixels[:, middle:]}.get(side, pixels)
+
+
+def copy_picture(task: tuple[Path, Path, int, str]) -> None:
     """Import a picture: JPEG and PNG of 8 bits as they are, all else as PNG of 8 bits.
 
     An EXIF orientation is taken off the copy, so that every program shows pixels as stored.
 
     Args:
         task: a file that `inspect` found whole; where it goes, with the suffix `target_suffix`
-            gives; and `bits_used` by all pictures of the camera: lower bits are cut off.
+            gives; `bits_used` by all pictures of the camera: lower bits are cut off; and the side
+            of `half_of`.
     """
-    source, target, bits = task
+    source, target, bits, side = task
     target.parent.mkdir(parents=True, exist_ok=True)
-    if source.suffix.lower() in COPIED and target.suffix == source.suffix.lower() and bits == 8:
+    if (
+        not side
+        and source.suffix.lower() in COPIED
+        and target.suffix == source.suffix.lower()
+        and bits == 8
+    ):
         if _with_exif(PictureFacts(path=source)).orientation == 1:
             shutil.copyfile(source, target)
             return
         if target.suffix != ".png":
             target.write_bytes(without_orientation(source.read_bytes()))
             return
-    pixels = decode(source)
+    pixels = half_of(decode(source), side)
     if pixels.dtype == np.uint16:
         pixels = (pixels >> (bits - 8)).astype(np.uint8)
     if not cv2.imwrite(str(target), pixels, [cv2.IMWRITE_PNG_COMPRESSION, 3]):

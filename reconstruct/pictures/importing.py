@@ -6,6 +6,7 @@ folders of any size take seconds; the import goes on from it, and finds what onl
 such as damaged files.
 """
 
+import os
 import shutil
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -190,6 +191,8 @@ class ImportScan:
     """Name of the camera of folders, videos and topics without one."""
     zone: tzinfo
     """Of dates that name none."""
+    split: bool
+    """Whether pictures and frames hold those of a left and a right camera side by side."""
     unnamed: bool
     """Whether the folders are of cameras that only their pictures tell apart."""
 
@@ -265,6 +268,7 @@ def scan_sources(
     time_zone: str = "UTC",
     rig: Path | None = None,
     apart: Sequence[Path] = (),
+    split: bool = False,
 ) -> ImportScan:
     """List what an import would take; arguments as of `import_images`, `apart` as of `look_into`.
 
@@ -278,6 +282,8 @@ def scan_sources(
             "give folders of pictures, or --left and --right, or --camera for each camera, or "
             "--video, or --bag: one of them"
         )
+    if split and (cameras or bag is not None):
+        raise ImageError("--split cuts the pictures of folders or the frames of videos: give these")
     every = [*folders, *cameras.values()]
     places = [folder.resolve() for folder in every]
     twice = [folder for folder in every if places.count(folder.resolve()) > 1]
@@ -288,7 +294,7 @@ def scan_sources(
     named = {name: [path] for name, path in cameras.items()}
     if folders:
         named = {mono: [*folders]}
-    return ImportScan(
+    found = ImportScan(
         folders={
             name: [look_into(path, [*every, *apart], recursive=recursive) for path in paths]
             for name, paths in named.items()
@@ -298,8 +304,15 @@ def scan_sources(
         rig=known_rig,
         mono=mono,
         zone=find_zone(time_zone),
-        unnamed=bool(folders) and known_rig is None,
+        split=split,
+        unnamed=bool(folders) and known_rig is None and not split,
     )
+    if split:
+        widths = {p.name: read_header(p).width_px for own in found.pictures.values() for p in own}
+        widths |= {recording.name: recording.size[0] for recording in found.recordings}
+        if odd := next((name for name, width in widths.items() if width % 2), ""):
+            raise ImageError(f"{odd} is {widths[odd]} pixels wide, which are no two halves")
+    return found
 
 
 _MAX_HEADERS = 300
@@ -318,6 +331,7 @@ def preview_import(
     clock_offset_s: float = 0.0,
     time_zone: str = "UTC",
     rig: Path | None = None,
+    split: bool = False,
 ) -> Preview:
     """Look at what `import_images` would take, with the same arguments.
 
@@ -328,7 +342,7 @@ def preview_import(
     with keep_warnings() as warnings:
         scan = scan_sources(
             folders, cameras or {}, videos, recursive=recursive, navigation=navigation,
-            time_zone=time_zone, rig=rig,
+            time_zone=time_zone, rig=rig, split=split,
         )  # fmt: skip
         log, recordings = scan.log, scan.recordings
     rows, facts = dict[str, CameraRow](), list[PictureFacts]()
@@ -341,10 +355,12 @@ def preview_import(
         names = names if scan.unnamed else names[:1]
         total = sum(count for _, _, count in names)
         for camera, (device, width, height), count in names:
-            rows[camera] = CameraRow(
-                pictures=round(len(paths) * count / total), width_px=width, height_px=height,
-                device=device,
+            sides = incoming.SIDES if split else (camera,)
+            row = CameraRow(
+                pictures=round(len(paths) * count / total), width_px=width // len(sides),
+                height_px=height, device=device,
             )  # fmt: skip
+            rows |= dict.fromkeys(sides, row)
     if scan.rig is not None:
         incoming.check_rig(
             {name: (row.width_px, row.height_px) for name, row in rows.items()}, scan.rig
@@ -439,6 +455,8 @@ def import_images(
     rig: Path | None = None,
     masks: Path | None = None,
     triggers: Path | None = None,
+    split: bool = False,
+    overwrite: bool = False,
     executor: Executor = SERIAL,
 ) -> ImportRecord:
     """Write `images/` from pictures, of cameras on a rig or not, or from videos.
@@ -474,6 +492,8 @@ def import_images(
         masks: folder of masks (0 = leave out), see `with_masks`, or with a folder per camera;
             without it those next to pictures.
         triggers: CSV with the time of every picture, see `pair_by_time`.
+        split: cut pictures and frames into those of the left and the right camera of a rig.
+        overwrite: replace the pictures of an earlier import by others.
         executor: where tasks run.
 
     Returns:
@@ -501,12 +521,17 @@ def import_images(
     _check_paths(workspace, given)
     scan = scan_sources(
         folders, cameras, videos, bag=bag, recursive=recursive, navigation=navigation,
-        time_zone=time_zone, rig=rig, apart=[*given, workspace],
+        time_zone=time_zone, rig=rig, apart=[*given, workspace], split=split,
     )  # fmt: skip
+    pictures = [path for folder in scan.every_folder for path in folder.pictures]
+    if not overwrite:
+        _refuse_others(
+            workspace, [*pictures, *scan.videos, *([bag] if bag else [])], ", or give --replace"
+        )
     frame_overlap = DEFAULT_OVERLAP if overlap is None else overlap
     stage = Stage(
         name="images",
-        version=6,
+        version=7,
         command="import-images",
         settings={
             "folders": len(folders),
@@ -515,6 +540,7 @@ def import_images(
             "every_s": every_s,
             "overlap": frame_overlap if videos else None,
             "recursive": recursive,
+            "split": split,
             "clock_offset_s": clock_offset_s,
             "time_zone": time_zone,
             "vertical_datum": vertical_datum,
@@ -533,7 +559,11 @@ def import_images(
         if scan.videos:
             one_camera = [scan.mono] * len(scan.recordings)
             names = one_camera if scan.rig else _cameras_by_size(scan.recordings, scan.mono)
-            entries = take_frames(scan.recordings, names, partial, frame_overlap, every_s)
+            if split:
+                names = [incoming.SIDES[0]] * len(scan.recordings)
+            entries = take_frames(
+                scan.recordings, names, partial, frame_overlap, every_s, split=split
+            )
         else:
             if bag is None:
                 paired = incoming.pair_by_time(scan.pictures, triggers, scan.zone)
@@ -546,6 +576,8 @@ def import_images(
                     for name, key, _ in incoming.camera_names([e.facts for e in entries], scan.mono)
                 }
                 entries = [replace(entry, camera=by_key[entry.facts.key]) for entry in entries]
+            if split:
+                entries = [half for entry in entries for half in incoming.halves(entry)]
         incoming.check_entries(entries, scan.rig)
         entries = incoming.unique_names(entries)
         entries = incoming.with_masks(entries, masks, stereo=bool(cameras))
@@ -623,6 +655,25 @@ def _check_paths(workspace: Path, given: Sequence[Path]) -> None:
             )
 
 
+def _refuse_others(workspace: Path, pictures: Sequence[Path], way_on: str) -> None:
+    """Refuse to replace pictures that were imported by others, of which none was among them."""
+    stage = read_stage(workspace / "images")
+    before = {} if stage is None else stage.inputs
+    moved = {(Path(name).name, *entry[:2]) for name, entry in before.items()}
+    for path in (f for p in pictures for f in (p.rglob("*") if p.is_dir() else [p])):
+        now = path.stat() if path.exists() else path.lstat()
+        if (
+            os.path.relpath(path, workspace) in before
+            or (path.name, now.st_size, now.st_mtime_ns) in moved
+        ):
+            return
+    if before:
+        raise WorkspaceError(
+            f"{workspace} holds pictures such as {next(iter(before))}, which others would replace: "
+            f"choose another workspace with -w{way_on}"
+        )
+
+
 _APART_S = 86_400.0
 """Between the end of a dive and the start of the next: their clocks are their own, and errors of
 navigation do not last from one to the other."""
@@ -668,6 +719,9 @@ def join_dives(workspace: Path, dives: Sequence[Path]) -> str:
             f"depths of the dives count from different levels ({', '.join(map(repr, levels))}): "
             "import them with one --vertical-datum"
         )
+    _refuse_others(
+        workspace, [f / r.image for f, own in zip(folders, rows, strict=True) for r in own], ""
+    )
     inputs = [
         folder / name
         for folder, records in zip(folders, rows, strict=True)

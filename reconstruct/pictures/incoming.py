@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from alice_survey.core.artefacts import read_csv
 from alice_survey.core.contents import as_line
-from alice_survey.core.errors import CalibrationError, ImageError, NavigationError, warn
+from alice_survey.core.errors import CalibrationError, ImageError, NavigationError, note, warn
 from alice_survey.core.executor import Executor, progress
 from alice_survey.core.frames import Array, distances_m
 from alice_survey.core.manifest import ImageRecord
@@ -42,10 +42,13 @@ from reconstruct.pictures.files import (
     PictureFacts,
     bits_used,
     copy_picture,
+    decode_stored,
+    half_of,
     inspect_shot,
     kind_of,
     list_names,
     mask_names,
+    opaque_part,
     safe_name,
     target_suffix,
     to_utc,
@@ -439,6 +442,7 @@ def pixels_of(message: Any) -> NDArray[Any]:
 
 UNDECODABLE = "cannot be decoded"
 MIRRORED = "mirror images"
+SIDES = ("left", "right")
 COPIES = "copies of others"
 SHOTS = "other files of a shot"
 
@@ -457,6 +461,19 @@ class Incoming:
     """Of a frame, since the start of the first recording; NaN where that is unknown."""
     recording: str = ""
     """Name of the recording that a frame is of."""
+    side: str = ""
+    """Where the file is cut for it, see `half_of`."""
+
+    @property
+    def file_px(self) -> tuple[int, int]:
+        """Width and height of the file."""
+        return self.facts.width_px * (2 if self.side else 1), self.facts.height_px
+
+
+def halves(entry: Incoming) -> list[Incoming]:
+    """The left and the right picture of a file that holds both side by side."""
+    facts = replace(entry.facts, width_px=entry.facts.width_px // 2)
+    return [replace(entry, camera=side, side=side, facts=facts) for side in SIDES]
 
 
 def find_entries(
@@ -596,7 +613,7 @@ def unique_names(entries: Sequence[Incoming]) -> list[Incoming]:
             named.append(entry)
             continue
         stem = safe_name(entry.source.stem)
-        suffix = target_suffix(entry.source, bits[entry.camera])
+        suffix = ".png" if entry.side else target_suffix(entry.source, bits[entry.camera])
         image, copy = f"{safe_name(entry.camera)}/{stem}{suffix}", 1
         while image.lower() in taken:
             copy += 1
@@ -633,7 +650,7 @@ def with_masks(entries: Sequence[Incoming], masks: Path | None, *, stereo: bool)
         named = (files[folder].get(one) for folder in folders for one in names)
         mask = next((one for one in named if one is not None), None)
         if mask is not None:
-            read_mask(mask, (entry.facts.width_px, entry.facts.height_px))
+            read_mask(mask, entry.file_px)
         found.append(replace(entry, mask=mask))
     if masks is not None:
         used = {entry.mask for entry in found} - {None}
@@ -643,13 +660,16 @@ def with_masks(entries: Sequence[Incoming], masks: Path | None, *, stereo: bool)
             such = f" (not {list_names(lost, 3)})" if lost else ""
             warn(f"{masks}: {len(used)} of {len(there)} masks belong to a picture{such}: give them "
                  "the names of their pictures")  # fmt: skip
+    cut_out = sum(entry.facts.cut_out and entry.side != SIDES[1] for entry in found)
+    if cut_out:
+        note(f"{cut_out} pictures are cut out: what their alpha leaves out is masked")
     return found
 
 
 def copy_all(entries: Sequence[Incoming], partial: Path, executor: Executor) -> list[str]:
     """Copy pictures to where their names say; what was lost in it, as notes."""
     bits = _bits(entries)
-    tasks = [(entry.source, partial / entry.image, bits[entry.camera]) for entry in entries]
+    tasks = [(e.source, partial / e.image, bits[e.camera], e.side) for e in entries]
     for _ in executor.map(copy_picture, tasks, label="copying pictures"):
         pass
     return [
@@ -661,10 +681,14 @@ def copy_all(entries: Sequence[Incoming], partial: Path, executor: Executor) -> 
 
 def record_of(entry: Incoming, partial: Path) -> ImageRecord:
     """Row of the manifest; writes the mask of the picture."""
-    mask = ""
+    mask, usable = "", None
     if entry.mask is not None:
+        usable = read_mask(entry.mask, entry.file_px)
+    if entry.facts.cut_out and (opaque := opaque_part(decode_stored(entry.source))) is not None:
+        usable = opaque if usable is None else usable & opaque
+    if usable is not None:
+        usable = half_of(usable, entry.side)
         mask = f"masks/{Path(entry.image).with_suffix('.png').as_posix()}"
-        usable = read_mask(entry.mask, (entry.facts.width_px, entry.facts.height_px))
         (partial / mask).parent.mkdir(parents=True, exist_ok=True)
         if not cv2.imwrite(str(partial / mask), usable.astype(np.uint8) * 255):
             raise ImageError(f"{partial / mask}: cannot be written")

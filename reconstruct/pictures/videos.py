@@ -26,8 +26,15 @@ from alice_survey.core.contents import ordinary_file
 from alice_survey.core.errors import ImageError, note, warn
 from alice_survey.core.executor import progress
 from alice_survey.core.frames import Array
-from reconstruct.pictures.files import VIDEO, PictureFacts, natural_key, safe_name, to_utc
-from reconstruct.pictures.incoming import Incoming
+from reconstruct.pictures.files import (
+    VIDEO,
+    PictureFacts,
+    half_of,
+    natural_key,
+    safe_name,
+    to_utc,
+)
+from reconstruct.pictures.incoming import SIDES, Incoming
 from reconstruct.pictures.quality import sharpness
 
 _MIN_FIX = 3
@@ -409,6 +416,8 @@ class Frame:
     """Since the start of the recording."""
     pixels: NDArray[np.uint8]
     """(H, W, 3) BGR."""
+    right: NDArray[np.uint8] | None = None
+    """Those of the right camera, where a frame holds both side by side."""
 
 
 @dataclass(kw_only=True)
@@ -652,6 +661,8 @@ def take_frames(
     folder: Path,
     overlap: float,
     every_s: float | None,
+    *,
+    split: bool = False,
 ) -> list[Incoming]:
     """Write the frames that are taken of each recording as PNG.
 
@@ -661,9 +672,10 @@ def take_frames(
         folder: of the stage.
         overlap: of neighbouring frames, where no interval is given.
         every_s: fixed interval in seconds.
+        split: frames hold pictures of a left and a right camera side by side.
 
     Returns:
-        The frames, each a station of its own.
+        The frames, each moment a station of its own.
 
     Raises:
         ImageError: a frame cannot be written.
@@ -675,16 +687,20 @@ def take_frames(
             name = f"{name}_{number + 1}"
         counts = FrameCounts()
         if every_s is None:
-            every = _frames(recording, (1.0 - 0.1) / _MAX_HZ, even=False)
+            every = _frames(recording, (1.0 - 0.1) / _MAX_HZ, even=False, split=split)
             frames = choose_frames(every, overlap, counts)
         else:
-            frames = _frames(recording, every_s, even=True)
+            frames = _frames(recording, every_s, even=True, split=split)
         for taken, frame in enumerate(frames):
-            image = f"{safe_name(camera)}/{name}_{taken:06d}.png"
-            (folder / image).parent.mkdir(parents=True, exist_ok=True)
-            if not cv2.imwrite(str(folder / image), frame.pixels):
-                raise ImageError(f"{folder / image}: cannot be written")
-            entries.append(_entry(recording, camera, frame, image, len(entries)))
+            station = entries[-1].station + 1 if entries else 0
+            for own, pixels in ((camera, frame.pixels), ("right", frame.right)):
+                if pixels is None:
+                    continue
+                image = f"{safe_name(own)}/{name}_{taken:06d}.png"
+                (folder / image).parent.mkdir(parents=True, exist_ok=True)
+                if not cv2.imwrite(str(folder / image), pixels):
+                    raise ImageError(f"{folder / image}: cannot be written")
+                entries.append(_entry(recording, own, frame, image, station))
         _report_counts(recording, counts)
     return entries
 
@@ -704,7 +720,7 @@ def _entry(recording: Recording, camera: str, frame: Frame, image: str, station:
     )  # fmt: skip
 
 
-def _frames(recording: Recording, step_s: float, *, even: bool) -> Iterator[Frame]:
+def _frames(recording: Recording, step_s: float, *, even: bool, split: bool) -> Iterator[Frame]:
     """Frames of all chapters a step or more apart, or at every multiple of it where `even`."""
     due_s, taken = -np.inf, 0
     for file in recording.files:
@@ -726,7 +742,8 @@ def _frames(recording: Recording, step_s: float, *, even: bool) -> Iterator[Fram
                     continue
                 taken += 1
                 due_s = step_s * taken if even else time_s + step_s
-                yield Frame(time_s=time_s, pixels=pixels)
+                left, right = (half_of(pixels, side) for side in SIDES) if split else (pixels, None)
+                yield Frame(time_s=time_s, pixels=left, right=right)
         finally:
             capture.release()
 

@@ -36,11 +36,13 @@ class ImportImagesCommand(WorkspaceCommand, ThreadsCommand):
         "import-images phone cameras --recursive -w reef",
         "import-images --video GX010042.MP4 --video GX020042.MP4 --overlap 0.7 -w reef",
         "import-images --video CARD --navigation dive.csv --time-zone Europe/Oslo -w reef",
+        "import-images --video zed.mp4 --split left-right --rig rig.json -w reef",
     )
     title = "Import pictures"
     offered = (
         "folders", "camera", "bag", "video", "overlap", "every", "recursive", "navigation",
-        "clock_offset", "time_zone", "vertical_datum", "rig", "masks", "triggers", "threads",
+        "clock_offset", "time_zone", "vertical_datum", "rig", "masks", "triggers", "split",
+        "replace", "threads",
     )  # fmt: skip
     folders: list[Path] | None = argument(None, "Folders of pictures; videos.", "DIR...")
     left: Path | None = option(None, "Pictures of the left camera.", metavar="DIR")
@@ -66,6 +68,8 @@ class ImportImagesCommand(WorkspaceCommand, ThreadsCommand):
     triggers: Path | None = option(
         None, "CSV: image or number, time_s or time_utc; camera.", metavar="FILE"
     )
+    split: Literal["left-right"] | None = option(None, "Cut frames that hold two cameras.")
+    replace: bool = option(False, "Replace an earlier import of others.")
 
     def cameras(self) -> dict[str, Path]:
         """Folder of each camera of a rig, by its name.
@@ -102,7 +106,8 @@ class ImportImagesCommand(WorkspaceCommand, ThreadsCommand):
                 recursive=self.recursive, navigation=self.navigation,
                 clock_offset_s=self.clock_offset, time_zone=self.time_zone,
                 vertical_datum=self.vertical_datum, rig=self.rig, masks=self.masks,
-                triggers=self.triggers, executor=self.executor(),
+                triggers=self.triggers, split=self.split is not None, overwrite=self.replace,
+                executor=self.executor(),
             )  # fmt: skip
         typer.echo(
             f"{found}\nin {self.workspace / 'images'}; next: alice-survey reconstruct -w "

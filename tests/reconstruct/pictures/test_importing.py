@@ -15,7 +15,7 @@ from alice_survey.core.executor import local_executor
 from alice_survey.core.manifest import read_manifest
 from camera_calib.rig import design_rig, read_rig, write_rig
 from reconstruct.pictures.files import inspect
-from reconstruct.pictures.importing import import_images
+from reconstruct.pictures.importing import import_images, join_dives, preview_import
 from tests.reconstruct.pictures.dated import counts, date, noise, reasons, rows_of, save, table
 
 
@@ -273,6 +273,94 @@ def test_masks_are_found_by_the_names_that_other_programs_give(
         (folder / name).rename(folder / f"other{name}")
         import_images(tmp_path / "w", [tmp_path / "in"], masks=folder)
         assert "0 of 1 masks" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("suffix", [".png", ".webp", ".tif"])
+def test_what_alpha_leaves_out_is_masked(
+    tmp_path: Path, suffix: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """An alpha that is opaque, or nowhere so, says nothing; a mask of a file counts as well."""
+    alphas = np.full((4, 48, 64), 255, np.uint8)
+    alphas[1, :9], alphas[1, 9:20], alphas[2], alphas[3, :, :7] = 100, 200, 0, 0
+    for number, alpha in enumerate(alphas):
+        image = Image.fromarray(np.dstack([noise(number), alpha]))
+        (tmp_path / "in").mkdir(exist_ok=True)
+        image.save(
+            tmp_path / "in" / f"{number}{suffix}",
+            **({"lossless": True} if suffix == ".webp" else {}),
+        )
+    named = np.full((48, 64), 255, np.uint8)
+    named[40:] = 0
+    cv2.imwrite(str(tmp_path / "in" / "3_mask.png"), named)
+    import_images(tmp_path / "w", [tmp_path / "in"])
+    assert "2 pictures are cut out" in capsys.readouterr().err
+    masks = [r.mask for r in rows_of(tmp_path / "w")]
+    assert [bool(mask) for mask in masks] == [False, True, False, True]
+    found = [cv2.imread(str(tmp_path / "w/images" / mask), 0) for mask in masks if mask]
+    np.testing.assert_array_equal(found[0], np.where(alphas[1] > 127, 255, 0))
+    np.testing.assert_array_equal(found[1], np.minimum(named, alphas[3]))
+
+
+def test_frames_of_two_cameras_are_cut_into_those_of_a_rig(tmp_path: Path) -> None:
+    """Without loss, with the halves of their masks, as pictures of two folders would be."""
+    frames = [noise(number, size=(128, 48)) for number in range(3)]
+    mask = np.full((48, 128), 255, np.uint8)
+    mask[:, :10], mask[:5, 64:] = 0, 0
+    for number, pixels in enumerate(frames):
+        save(tmp_path / "in" / f"f{number}.jpg", pixels, taken=date(number))
+        stored = cv2.imread(str(tmp_path / "in" / f"f{number}.jpg"))
+        for side, half in (("left", stored[:, :64]), ("right", stored[:, 64:])):
+            (tmp_path / side).mkdir(exist_ok=True)
+            cv2.imwrite(str(tmp_path / side / f"f{number}.png"), half)
+    cv2.imwrite(str(tmp_path / "in" / "f1_mask.png"), mask)
+    rig = design_rig(CameraConfig(), WaterConfig())
+    small = {n: replace(model, width_px=64, height_px=48) for n, model in rig.cameras.items()}
+    write_rig(tmp_path / "rig.json", replace(rig, cameras=small))
+    found = import_images(tmp_path / "w", [tmp_path / "in"], split=True, rig=tmp_path / "rig.json")
+    seen = preview_import([tmp_path / "in"], split=True)
+    assert counts(found) == counts(seen) == {"left": 3, "right": 3}
+    assert seen.cameras["right"].width_px == 64
+    import_images(tmp_path / "v", [], cameras=pair_in(tmp_path))
+    cut, apart = rows_of(tmp_path / "w"), rows_of(tmp_path / "v")
+    key = [(r.image, r.camera, r.station) for r in cut]
+    assert key == [(r.image, r.camera, r.station) for r in apart]
+    assert [r.time_s for r in cut] == [0, 0, 1, 1, 2, 2]
+    for r in cut:
+        one, other = (cv2.imread(str(tmp_path / w / "images" / r.image)) for w in "wv")
+        np.testing.assert_array_equal(one, other)
+    masks = [cv2.imread(str(tmp_path / "w/images" / r.mask), 0) for r in cut if r.mask]
+    np.testing.assert_array_equal(np.hstack(masks), mask)
+    with pytest.raises(ImageError, match="--split"):
+        import_images(tmp_path / "u", [], cameras=pair_in(tmp_path), split=True)
+    save(tmp_path / "in" / "odd.png", noise(9, size=(63, 48)))
+    (tmp_path / "in" / "f0.jpg").write_bytes(b"never decoded")
+    with pytest.raises(ImageError, match="63"):
+        import_images(tmp_path / "u", [tmp_path / "in"], split=True)
+
+
+def test_pictures_of_another_import_are_not_replaced(tmp_path: Path) -> None:
+    work, one = tmp_path / "w", several(tmp_path / "a", 3)
+    import_images(work, [one])
+    (one / "0.jpg").unlink()
+    draw(one / "9.jpg", 9)
+    assert counts(import_images(work, [one])) == {"camera": 3}
+    moved = one.rename(tmp_path / "moved")
+    assert counts(import_images(work, [moved])) == {"camera": 3}
+    other = several(tmp_path / "b", 4, suffix=".png")
+    (moved / "1.jpg").write_bytes(b"never decoded")
+    with pytest.raises(WorkspaceError, match="--replace"):
+        import_images(work, [other])
+    assert len(rows_of(work)) == 3
+    assert counts(import_images(work, [other], overwrite=True)) == {"camera": 4}
+    dives = [tmp_path / "d1", tmp_path / "d2"]
+    for dive in dives:
+        import_images(dive, [other])
+    with pytest.raises(WorkspaceError, match="-w"):
+        join_dives(work, dives)
+    for _ in range(2):
+        join_dives(tmp_path / "both", dives)
+    with pytest.raises(WorkspaceError, match="--replace"):
+        import_images(tmp_path / "both", [other])
 
 
 def test_names_stay_inside_and_apart(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from zoneinfo import ZoneInfo
 
+import cv2
 import numpy as np
 import pytest
 
@@ -187,3 +188,19 @@ def test_telemetry_that_states_too_much_counts_as_none(tmp_path: Path) -> None:
         assert len(read_fixes(path, 1.0).time_s) == 0
     path = gopro.film(tmp_path / "a.mp4", levels(0, 5), payloads=[good])
     assert len(read_fixes(path, 1.0).time_s) == 3
+
+
+def test_frames_of_videos_are_cut_too(tmp_path: Path) -> None:
+    """The left half of a frame is dark, the right one bright."""
+    frames = [np.hstack([f, 255 - f]) for f in levels(5, 20)]
+    video = gopro.film(tmp_path / "zed.mp4", frames)
+    found = import_images(tmp_path / "w", [], videos=[video], every_s=0.5, split=True)
+    assert counts(found) == {"left": 4, "right": 4}
+    records = rows_of(tmp_path / "w")
+    assert [(r.camera, r.station) for r in records[:4]] == [
+        ("left", 0), ("right", 0), ("left", 1), ("right", 1),
+    ]  # fmt: skip
+    assert [r.time_s for r in records] == pytest.approx(np.repeat(np.arange(4) * 0.5, 2))
+    means = [cv2.imread(str(tmp_path / "w/images" / r.image)).mean() for r in records]
+    np.testing.assert_allclose(np.add(means[::2], means[1::2]), 255, atol=10)
+    assert max(means[::2]) < 100

@@ -182,6 +182,7 @@ class _StartPage:
                 () if rig else folders, cameras=rig or given.cameras(), videos=given.video or (),
                 recursive=given.recursive, navigation=given.navigation, rig=given.rig,
                 clock_offset_s=given.clock_offset, time_zone=given.time_zone,
+                split=given.split is not None,
             )  # fmt: skip
         except WorkspaceError as fault:  # of a rig that is none, which was chosen wrongly
             raise AliceError(str(fault)) from None
