@@ -5,7 +5,7 @@ import re
 import struct
 import warnings
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.core.contents import ordinary_file
+from alice_survey.core.contents import one_line, ordinary_file
 from alice_survey.core.errors import ImageError, memory_shortage
 
 MAX_PIXELS = 104_000_000
@@ -60,6 +60,23 @@ def places_of_cameras(texts: Sequence[str]) -> dict[str, str]:
     if len(places) > _MAX_CAMERAS:
         raise ImageError(f"{len(places)} cameras are given, {_MAX_CAMERAS} at most")
     return places
+
+
+@contextlib.contextmanager
+def opened_picture(path: Path) -> Iterator[Any]:
+    """A picture opened by Pillow, without its warnings.
+
+    Raises:
+        ImageError: it is damaged, or of a kind that Pillow does not know.
+    """
+    from PIL import Image
+
+    try:
+        with warnings.catch_warnings(), Image.open(ordinary_file(path, None)) as image:
+            warnings.simplefilter("ignore")
+            yield image
+    except (*PILLOW_FAULTS, Image.DecompressionBombError) as error:
+        raise ImageError(f"corrupt: {one_line(error)}".replace(str(path), path.name)) from None
 
 
 _MAX_BYTES = 4 << 30
@@ -180,14 +197,10 @@ def exif_time(exif: Any) -> datetime | None:
 
 def time_taken(path: Path) -> datetime | None:
     """The time in a picture's EXIF, with or without a zone; None where it has none."""
-    from PIL import Image
-
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            with Image.open(ordinary_file(path, None)) as image:
-                return exif_time(image.getexif())
-    except (*PILLOW_FAULTS, Image.DecompressionBombError):
+        with opened_picture(path) as image:
+            return exif_time(image.getexif())
+    except ImageError:
         return None
 
 

@@ -3,14 +3,13 @@
 Nothing here imports the modules that do the work: they are named, and loaded when a stage is made.
 """
 
-import hashlib
 import json
 import math
 from collections.abc import Collection
 from pathlib import Path
 
 from alice_survey.core import records
-from alice_survey.core.artefacts import read_csv, read_stage
+from alice_survey.core.artefacts import content_token, read_csv, read_stage
 from alice_survey.core.errors import WorkspaceError
 from alice_survey.core.manifest import read_manifest
 from alice_survey.core.products import listed_in
@@ -78,8 +77,7 @@ def _picks_of_control(workspace: Path) -> dict[str, str]:
         for _, row in read_csv(path, fault=WorkspaceError)[1]
         if controls(row.get("point", ""), known) and (row.get("x") or row.get("y"))
     ]
-    digest = hashlib.blake2b(json.dumps(picks).encode(), digest_size=16).hexdigest()
-    return {"picks": digest} if picks else {}
+    return {"picks": content_token(json.dumps(picks).encode())} if picks else {}
 
 
 def _placing_summary(folder: Path) -> Summary:

@@ -4,9 +4,7 @@ import math
 import os
 import re
 import shutil
-import warnings
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, tzinfo
 from pathlib import Path
@@ -16,16 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.core.contents import as_line, is_nowhere, is_unknown, one_line, ordinary_file
+from alice_survey.core.contents import as_line, is_nowhere, is_unknown, ordinary_file
 from alice_survey.core.errors import ImageError
-from camera_calib.picture_files import (
-    KINDS,
-    PILLOW_FAULTS,
-    exif_time,
-    pixels_too_many,
-    read_pixels,
-    without_orientation,
-)
+from camera_calib import picture_files
 
 HEIC = (".heic", ".heif", ".hif", ".avif")
 COPIED = (".jpg", ".jpeg", ".png")
@@ -38,6 +29,7 @@ VIDEO = (
     ".360", ".avi", ".insv", ".lrv", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg",
     ".mts", ".webm", ".wmv",
 )  # fmt: skip
+ENDS = [end for ends in picture_files.KINDS.values() for end in ends]
 IN_FOLDERS = "in folders inside"
 ADVICE = {
     "HEIC": "save them as JPEG",
@@ -139,7 +131,7 @@ def look_into(
         held = [f"{len(paths)} {reason}; {ADVICE[reason]}" for reason, paths in left_out.items()
                 if paths]  # fmt: skip
         raise ImageError(
-            f"{folder}: holds no pictures ({', '.join(KINDS)} or camera RAW)"
+            f"{folder}: holds no pictures ({', '.join(picture_files.KINDS)} or camera RAW)"
             + (f", but {', '.join(held)}" if held else "")
         )
     return PictureFolder(
@@ -157,13 +149,12 @@ def mask_names(picture: str) -> list[str]:
     has it.
     """
     name, stem = picture.lower(), Path(picture).stem.lower()
-    ends = (end for kind in KINDS.values() for end in kind)
-    return [f"{name}.png", f"{name}_mask.png", *(f"{stem}_mask{end}" for end in ends)]
+    return [f"{name}.png", f"{name}_mask.png", *(f"{stem}_mask{end}" for end in ENDS)]
 
 
 def kind_of(path: Path) -> str:
     """A kind of `KINDS`, or `RAW`, by the name of a file; empty for all others."""
-    suffix, kinds = path.suffix.lower(), {**KINDS, "RAW": RAW}
+    suffix, kinds = path.suffix.lower(), {**picture_files.KINDS, "RAW": RAW}
     return next((kind for kind, names in kinds.items() if suffix in names), "")
 
 
@@ -193,16 +184,14 @@ def inspect(path: Path) -> PictureFacts:
     try:
         if not path.is_file():
             return PictureFacts(path=path, fault="not a regular file")
-        stored = decode_stored(path)
+        stored = decode(path, alpha=True)
     except (ImageError, OSError) as error:
         return PictureFacts(path=path, fault=str(error))
     height, width = stored.shape[:2]
-    facts = PictureFacts(
-        path=path, width_px=width, height_px=height,
-        highest=int(_without_alpha(stored).max(initial=0)),
-        cut_out=opaque_part(stored) is not None,
-    )  # fmt: skip
-    facts = _with_exif(facts)
+    highest = int(stored[..., :3].max(initial=0) if stored.ndim == 3 else stored.max(initial=0))
+    cut_out = not opaque_part(stored).all()
+    facts = PictureFacts(path=path, width_px=width, height_px=height, highest=highest)
+    facts = _with_exif(replace(facts, cut_out=cut_out))
     if facts.orientation in _MIRRORED:
         fault = f"a mirror image by its EXIF orientation {facts.orientation}: save it as it is seen"
         return replace(facts, fault=f"{fault}, without that tag")
@@ -211,10 +200,9 @@ def inspect(path: Path) -> PictureFacts:
 
 def inspect_shot(paths: Sequence[Path]) -> list[PictureFacts]:
     """What the files of one shot hold, up to the first that can be used."""
-    tried: list[PictureFacts] = []
-    for path in paths:
-        if not tried or tried[-1].fault:
-            tried.append(inspect(path))
+    tried = [inspect(paths[0])]
+    while tried[-1].fault and len(tried) < len(paths):
+        tried.append(inspect(paths[len(tried)]))
     return tried
 
 
@@ -229,15 +217,13 @@ def same_shots(pictures: Sequence[Path]) -> list[list[Path]]:
         named.setdefault(path.stem.lower(), []).append(path)
     shots: list[list[PictureFacts]] = []
     for some in named.values():
-        own: list[list[PictureFacts]] = []
-        headers = map(read_header, some) if len({kind_of(path) for path in some}) > 1 else ()
+        own = len(shots)
+        headers = map(read_header, some) if len({*map(kind_of, some)}) > 1 else ()
         for one in sorted(headers, key=_preference, reverse=True):
-            shot = next((s for s in own if all(_is_one_shot(one, other) for other in s)), None)
-            if shot is None:
-                own.append([one])
-            else:
-                shot.append(one)
-        shots += own
+            fits = (shot for shot in shots[own:] if all(_is_one_shot(one, two) for two in shot))
+            if (shot := next(fits, [])) == []:
+                shots.append(shot)
+            shot.append(one)
     return [[facts.path for facts in shot] for shot in shots if len(shot) > 1]
 
 
@@ -248,10 +234,8 @@ def _preference(facts: PictureFacts) -> tuple[float, ...]:
 
 
 def _is_one_shot(one: PictureFacts, other: PictureFacts) -> bool:
-    times = [
-        f.time_local and f.time_local.replace(microsecond=0, tzinfo=None) for f in (one, other)
-    ]
-    same = one.path.parent == other.path.parent if None in times else times[0] == times[1]
+    times = [str(facts.time_local or "")[:19] for facts in (one, other)]
+    same = times[0] == times[1] if all(times) else one.path.parent == other.path.parent
     return same and kind_of(one.path) != kind_of(other.path)
 
 
@@ -259,7 +243,7 @@ def read_header(path: Path) -> PictureFacts:
     """What a picture states, without decoding it; size 0 where only decoding can tell."""
     size, raw = (0, 0), path.suffix.lower() in RAW
     try:
-        with _pillow(path) as image:
+        with picture_files.opened_picture(path) as image:
             size = image.size
     except ImageError as error:
         return PictureFacts(path=path, fault="" if raw else str(error))
@@ -267,66 +251,36 @@ def read_header(path: Path) -> PictureFacts:
     return _with_exif(PictureFacts(path=path, width_px=width, height_px=height))
 
 
-def opaque_part(stored: NDArray[Any]) -> NDArray[np.bool_] | None:
-    """(H, W) where a picture is more opaque than not; None where that is everywhere or nowhere."""
+def opaque_part(stored: NDArray[Any]) -> NDArray[np.bool_]:
+    """(H, W) where a picture is more opaque than not; everywhere where that would be nowhere."""
     if stored.ndim < 3 or stored.shape[2] < 4:
-        return None
+        return np.ones(stored.shape[:2], np.bool_)
     opaque: NDArray[np.bool_] = stored[..., 3] > np.iinfo(stored.dtype).max // 2
-    return opaque if opaque.any() and not opaque.all() else None
+    return opaque if opaque.any() else ~opaque
 
 
-def _without_alpha(stored: NDArray[Any]) -> NDArray[Any]:
-    return np.ascontiguousarray(stored[..., :3] if stored.ndim == 3 else stored)
-
-
-def decode(path: Path) -> NDArray[Any]:
-    """All pixels of a picture, (H, W) or (H, W, 3) BGR, 8 or 16 bits.
-
-    Raises:
-        ImageError: it cannot be decoded to its end.
-    """
-    return _without_alpha(decode_stored(path))
-
-
-def decode_stored(path: Path) -> NDArray[Any]:
-    """All pixels of a picture as `decode` has them, with their alpha as the fourth channel.
+def decode(path: Path, *, alpha: bool = False) -> NDArray[Any]:
+    """All pixels of a picture, (H, W) or (H, W, 3) BGR, or BGRA where asked for; 8 or 16 bits.
 
     Raises:
         ImageError: it cannot be decoded to its end.
     """
     suffix = path.suffix.lower()
-    if maximum := pixels_too_many(path):
+    if maximum := picture_files.pixels_too_many(path):
         raise ImageError(f"states over {maximum / 1e6:.0f} million pixels: make it smaller")
     if suffix in RAW:
         return _develop(path)
-    if suffix not in KINDS["TIFF"]:
-        with _pillow(path) as image:  # it refuses truncated files; OpenCV fills them with grey
-            image.load()
-    pixels = read_pixels(path, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+    if suffix not in picture_files.KINDS["TIFF"]:
+        with picture_files.opened_picture(path) as image:
+            image.load()  # it refuses truncated files; OpenCV fills them with grey
+    pixels = picture_files.read_pixels(path, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
     if pixels is None:
         raise ImageError("cannot be decoded")
     if pixels.dtype not in (np.uint8, np.uint16):
         raise ImageError(f"holds {pixels.dtype} pixels; 8 or 16 bits can be read")
     if pixels.ndim == 3 and pixels.shape[2] not in (3, 4):
         raise ImageError(f"has {pixels.shape[2]} channels; 1, 3 or 4 can be read")
-    return pixels
-
-
-@contextmanager
-def _pillow(path: Path) -> Iterator[Any]:
-    """A picture opened by Pillow, without its warnings.
-
-    Raises:
-        ImageError: it is damaged, or of a kind that Pillow does not know.
-    """
-    from PIL import Image
-
-    try:
-        with warnings.catch_warnings(), Image.open(ordinary_file(path, None)) as image:
-            warnings.simplefilter("ignore")
-            yield image
-    except (*PILLOW_FAULTS, Image.DecompressionBombError) as error:
-        raise ImageError(f"corrupt: {one_line(error)}".replace(str(path), path.name)) from None
+    return np.ascontiguousarray(pixels[..., :3] if pixels.ndim == 3 and not alpha else pixels)
 
 
 def _develop(path: Path) -> NDArray[Any]:
@@ -348,9 +302,9 @@ def _develop(path: Path) -> NDArray[Any]:
 
 def _with_exif(facts: PictureFacts) -> PictureFacts:
     try:
-        with _pillow(facts.path) as image:
+        with picture_files.opened_picture(facts.path) as image:
             exif = image.getexif()
-            gps, time_local = exif.get_ifd(_GPS), exif_time(exif)
+            gps, time_local = exif.get_ifd(_GPS), picture_files.exif_time(exif)
             orientation = exif.get(_ORIENTATION, 1)
             device = _device(exif)
     except ImageError:
@@ -384,7 +338,7 @@ def _device(exif: Any) -> str:
     focal, film = _number(details.get(_FOCAL)), _film_mm(details)
     lens = [f"{focal:.3g} mm"] if 0 < focal < _MAX_FOCAL_MM else []
     lens += [f"({film:.3g} mm on film)"] if film > 0 else []
-    return ", ".join(filter(None, [body, " ".join(lens)]))
+    return " at ".join(filter(None, [body, " ".join(lens)]))
 
 
 def _film_mm(details: Any) -> float:
@@ -412,9 +366,8 @@ def _angle(gps: Any, key: int, maximum: float) -> float | None:
 
 
 def _altitude(gps: Any) -> float | None:
-    altitude = _number(gps.get(6))
-    below = gps.get(5) in (1, b"\x01")
-    return None if is_unknown(altitude) else -altitude if below else altitude
+    altitude = _number(gps.get(6)) * (-1.0 if gps.get(5) in (1, b"\x01") else 1.0)
+    return None if is_unknown(altitude) else altitude
 
 
 def exif_focal_px(path: Path, width_px: int, height_px: int) -> float:
@@ -424,7 +377,7 @@ def exif_focal_px(path: Path, width_px: int, height_px: int) -> float:
     per cent).
     """
     try:
-        with _pillow(path) as image:
+        with picture_files.opened_picture(path) as image:
             film = _film_mm(image.getexif().get_ifd(_EXIF))
     except ImageError:
         return float("nan")
@@ -459,17 +412,13 @@ def copy_picture(task: tuple[Path, Path, int, str]) -> None:
     """
     source, target, bits, side = task
     target.parent.mkdir(parents=True, exist_ok=True)
-    if (
-        not side
-        and source.suffix.lower() in COPIED
-        and target.suffix == source.suffix.lower()
-        and bits == 8
-    ):
+    as_it_is = source.suffix.lower() in COPIED and target.suffix == source.suffix.lower()
+    if as_it_is and bits == 8 and not side:
         if _with_exif(PictureFacts(path=source)).orientation == 1:
             shutil.copyfile(source, target)
             return
         if target.suffix != ".png":
-            target.write_bytes(without_orientation(source.read_bytes()))
+            target.write_bytes(picture_files.without_orientation(source.read_bytes()))
             return
     pixels = half_of(decode(source), side)
     if pixels.dtype == np.uint16:

@@ -20,14 +20,7 @@ from typing import ClassVar
 import numpy as np
 from pydantic import Field
 
-from alice_survey.core.artefacts import (
-    JsonRecord,
-    Stage,
-    need_stage,
-    read_stage,
-    run_stage,
-    write_json,
-)
+from alice_survey.core import artefacts
 from alice_survey.core.errors import (
     CalibrationError,
     ImageError,
@@ -43,19 +36,7 @@ from camera_calib.rig import Rig, read_rig, write_rig
 from missions.logs.navigation_csv import NavigationLog, find_zone, read_navigation
 from missions.values.legs import Route
 from missions.values.plan_file import Plan, read_plan
-from reconstruct.pictures import incoming
-from reconstruct.pictures.files import (
-    ADVICE,
-    VIDEO,
-    PictureFacts,
-    PictureFolder,
-    kind_of,
-    list_names,
-    look_into,
-    read_header,
-    same_shots,
-    to_utc,
-)
+from reconstruct.pictures import files, incoming
 from reconstruct.pictures.videos import (
     DEFAULT_OVERLAP,
     Recording,
@@ -72,13 +53,13 @@ _ADVICE = {
     incoming.MIRRORED: "save them as they are seen, without an EXIF orientation",
     incoming.COPIES: "each file counts once",
     incoming.SHOTS: "of each the RAW is taken, else that of most pixels, else no JPEG",
-    **ADVICE,
+    **files.ADVICE,
 }
 _NAMED = 3
 FRAMES = "frames of videos"
 
 
-class CameraRow(JsonRecord):
+class CameraRow(artefacts.JsonRecord):
     """A camera that took pictures."""
 
     pictures: int
@@ -94,7 +75,7 @@ class CameraRow(JsonRecord):
         return f"{text}, {self.device}" if self.device else text
 
 
-class RecordingRow(JsonRecord):
+class RecordingRow(artefacts.JsonRecord):
     """A recording whose frames were taken."""
 
     files: tuple[str, ...]
@@ -111,7 +92,7 @@ class RecordingRow(JsonRecord):
         return f"{self.frames} frames of {self.duration_s:.0f} s{of}, {began}"
 
 
-class ImportRecord(JsonRecord):
+class ImportRecord(artefacts.JsonRecord):
     """`images/imported.json`: what a workspace got, and what was left out."""
 
     path: ClassVar = "images/imported.json"
@@ -132,8 +113,8 @@ class ImportRecord(JsonRecord):
     def omissions(self) -> list[str]:
         """A line for each reason: how many were left out, such as which, and what to do."""
         return [
-            f"left out: {len(names)} {reason} ({list_names(names, _NAMED)}); {_ADVICE[reason]}"
-            for reason, names in self.left_out.items()
+            f"left out: {len(some)} {reason} ({files.list_names(some, _NAMED)}); {_ADVICE[reason]}"
+            for reason, some in self.left_out.items()
         ]
 
     @property
@@ -182,7 +163,7 @@ class Preview(ImportRecord):
 class ImportScan:
     """What folders, videos and a log hold, before any picture is decoded."""
 
-    folders: Mapping[str, Sequence[PictureFolder]]
+    folders: Mapping[str, Sequence[files.PictureFolder]]
     """By camera; folders without a name are those of `mono`."""
     videos: Sequence[Path]
     navigation: Path | None
@@ -197,7 +178,7 @@ class ImportScan:
     """Whether the folders are of cameras that only their pictures tell apart."""
 
     @property
-    def every_folder(self) -> list[PictureFolder]:
+    def every_folder(self) -> list[files.PictureFolder]:
         """All folders."""
         return [folder for own in self.folders.values() for folder in own]
 
@@ -205,7 +186,7 @@ class ImportScan:
     def shots(self) -> dict[Path, list[Path]]:
         """Other files of the same shot, by the one that is taken."""
         every = [[p for f in own for p in f.pictures] for own in self.folders.values()]
-        return {first: others for own in every for first, *others in same_shots(own)}
+        return {first: others for own in every for first, *others in files.same_shots(own)}
 
     @cached_property
     def pictures(self) -> dict[str, list[Path]]:
@@ -296,7 +277,7 @@ def scan_sources(
         named = {mono: [*folders]}
     found = ImportScan(
         folders={
-            name: [look_into(path, [*every, *apart], recursive=recursive) for path in paths]
+            name: [files.look_into(path, [*every, *apart], recursive=recursive) for path in paths]
             for name, paths in named.items()
         },
         videos=find_videos(videos),
@@ -308,7 +289,8 @@ def scan_sources(
         unnamed=bool(folders) and known_rig is None and not split,
     )
     if split:
-        widths = {p.name: read_header(p).width_px for own in found.pictures.values() for p in own}
+        taken = [path for own in found.pictures.values() for path in own]
+        widths = {path.name: files.read_header(path).width_px for path in taken}
         widths |= {recording.name: recording.size[0] for recording in found.recordings}
         if odd := next((name for name, width in widths.items() if width % 2), ""):
             raise ImageError(f"{odd} is {widths[odd]} pixels wide, which are no two halves")
@@ -345,11 +327,11 @@ def preview_import(
             time_zone=time_zone, rig=rig, split=split,
         )  # fmt: skip
         log, recordings = scan.log, scan.recordings
-    rows, facts = dict[str, CameraRow](), list[PictureFacts]()
+    rows, facts = dict[str, CameraRow](), list[files.PictureFacts]()
     for name, paths in scan.pictures.items():
         # Some headers, evenly spread, with the first and the last.
         chosen = np.unique(np.linspace(0, len(paths) - 1, min(len(paths), _MAX_HEADERS)).round())
-        seen = [read_header(paths[int(i)]) for i in chosen]
+        seen = [files.read_header(paths[int(i)]) for i in chosen]
         facts += seen
         names = incoming.camera_names([one for one in seen if not one.fault], name)
         names = names if scan.unnamed else names[:1]
@@ -365,11 +347,11 @@ def preview_import(
         incoming.check_rig(
             {name: (row.width_px, row.height_px) for name, row in rows.items()}, scan.rig
         )
-    times = [to_utc(one.time_local, scan.zone) for one in facts if one.time_local is not None]
-    began = [(to_utc(r.start, scan.zone), r.duration_s) for r in recordings if r.start is not None]
+    times = [files.to_utc(one.time_local, scan.zone) for one in facts if one.time_local is not None]
+    began = [(files.to_utc(r.start, scan.zone), r.duration_s) for r in recordings if r.start]
     spans = [*times, *(t for t, _ in began), *(t + timedelta(seconds=s) for t, s in began)]
     pictures = [path for paths in scan.pictures.values() for path in paths]
-    files = [*pictures, *(file.path for r in recordings for file in r.files)]
+    every = [*pictures, *(file.path for r in recordings for file in r.files)]
     text = ""
     if log is not None:
         known = [name for name, values in log.columns.items() if np.isfinite(values).any()]
@@ -385,18 +367,16 @@ def preview_import(
                 f"{len(times)} picture times fall into it"
             )
     record = scan.record(
-        rows, Counter(kind_of(path) for path in pictures), Counter(),
-        {
-            _NO_HEADER: [one.path.name for one in facts if one.fault],
-            incoming.SHOTS: [p.name for others in scan.shots.values() for p in others],
-        },
+        rows, Counter(files.kind_of(path) for path in pictures), Counter(),
+        {_NO_HEADER: [one.path.name for one in facts if one.fault],
+         incoming.SHOTS: [p.name for others in scan.shots.values() for p in others]},
     )  # fmt: skip
     return Preview(
         **dict(record) | {
             "positions": sum(one.latitude_deg is not None for one in facts),
             "pictures": len(pictures),
             "looked_at": len(facts),
-            "size_mb": sum(path.stat().st_size for path in files) / 1e6,
+            "size_mb": sum(path.stat().st_size for path in every) / 1e6,
             "videos": len(recordings),
             "video_s": sum(r.duration_s for r in recordings),
             "first_utc": min(spans).isoformat(timespec="seconds") if spans else None,
@@ -416,10 +396,10 @@ def cameras_in(folder: Path) -> dict[str, Path]:
     """
     try:
         inside = sorted(p for p in folder.iterdir() if not p.name.startswith("."))
-        if any(path.is_file() and kind_of(path) for path in inside):
+        if any(path.is_file() and files.kind_of(path) for path in inside):
             return {}
         counts = {
-            path.name: sum(1 for p in path.iterdir() if kind_of(p))
+            path.name: sum(1 for p in path.iterdir() if files.kind_of(p))
             for path in inside
             if path.is_dir() and not path.is_symlink()
         }
@@ -505,7 +485,7 @@ def import_images(
         NavigationError: the navigation log cannot be used, or a level is named without one.
         CalibrationError: the rig file is wrong or not that of the pictures.
     """
-    videos = [*videos, *(f for f in folders if f.is_file() and f.suffix.lower() in VIDEO)]
+    videos = [*videos, *(f for f in folders if f.is_file() and f.suffix.lower() in files.VIDEO)]
     folders = [folder for folder in folders if folder not in videos]
     if triggers is not None and not (folders or cameras):
         raise ImageError("--triggers is for folders of pictures: videos and bags have times")
@@ -523,13 +503,12 @@ def import_images(
         folders, cameras, videos, bag=bag, recursive=recursive, navigation=navigation,
         time_zone=time_zone, rig=rig, apart=[*given, workspace], split=split,
     )  # fmt: skip
-    pictures = [path for folder in scan.every_folder for path in folder.pictures]
     if not overwrite:
-        _refuse_others(
-            workspace, [*pictures, *scan.videos, *([bag] if bag else [])], ", or give --replace"
-        )
+        taken = [path for folder in scan.every_folder for path in folder.pictures]
+        taken += [*scan.videos, *([bag] if bag else [])]
+        _refuse_others(workspace, taken, ", or give --replace")
     frame_overlap = DEFAULT_OVERLAP if overlap is None else overlap
-    stage = Stage(
+    stage = artefacts.Stage(
         name="images",
         version=7,
         command="import-images",
@@ -557,10 +536,9 @@ def import_images(
         notes: list[str] = []
         left_out: dict[str, list[str]] = {}
         if scan.videos:
-            one_camera = [scan.mono] * len(scan.recordings)
-            names = one_camera if scan.rig else _cameras_by_size(scan.recordings, scan.mono)
-            if split:
-                names = [incoming.SIDES[0]] * len(scan.recordings)
+            one_camera = [incoming.SIDES[0] if split else scan.mono] * len(scan.recordings)
+            one = split or scan.rig is not None
+            names = one_camera if one else _cameras_by_size(scan.recordings, scan.mono)
             entries = take_frames(
                 scan.recordings, names, partial, frame_overlap, every_s, split=split
             )
@@ -606,7 +584,7 @@ def import_images(
                 for name in dict.fromkeys([*scan.folders, *sorted(counted)])
                 if counted[name]
             },
-            Counter(FRAMES if e.recording else kind_of(e.source) for e in entries),
+            Counter(FRAMES if e.recording else files.kind_of(e.source) for e in entries),
             Counter(entry.recording for entry in entries),
             left_out,
         )  # fmt: skip
@@ -618,7 +596,7 @@ def import_images(
             notes=(*notes, *record.lines),
         ).write(partial / "survey.json")
 
-    changed = run_stage(workspace, stage, work)
+    changed = artefacts.run_stage(workspace, stage, work)
     records = read_manifest(workspace / "images" / "manifest.csv")
     return ImportRecord.read(workspace / ImportRecord.path).model_copy(
         update={
@@ -657,15 +635,12 @@ def _check_paths(workspace: Path, given: Sequence[Path]) -> None:
 
 def _refuse_others(workspace: Path, pictures: Sequence[Path], way_on: str) -> None:
     """Refuse to replace pictures that were imported by others, of which none was among them."""
-    stage = read_stage(workspace / "images")
+    stage = artefacts.read_stage(workspace / "images")
     before = {} if stage is None else stage.inputs
     moved = {(Path(name).name, *entry[:2]) for name, entry in before.items()}
     for path in (f for p in pictures for f in (p.rglob("*") if p.is_dir() else [p])):
-        now = path.stat() if path.exists() else path.lstat()
-        if (
-            os.path.relpath(path, workspace) in before
-            or (path.name, now.st_size, now.st_mtime_ns) in moved
-        ):
+        now, known = path.lstat(), os.path.relpath(path, workspace) in before
+        if known or (path.name, now.st_size, now.st_mtime_ns) in moved:
             return
     if before:
         raise WorkspaceError(
@@ -705,7 +680,7 @@ def join_dives(workspace: Path, dives: Sequence[Path]) -> str:
         raise WorkspaceError(f"{workspace} is one of the dives: choose another with -w")
     if (workspace / "images" / "truth").exists():
         raise WorkspaceError(f"{workspace} holds a simulated survey: choose another with -w")
-    folders = [need_stage(dive, "images", "import-images") for dive in dives]
+    folders = [artefacts.need_stage(dive, "images", "import-images") for dive in dives]
     rig = _same_rig(dives)
     surveys = [PicturesRecord.read(folder / "survey.json") for folder in folders]
     rows = [read_manifest(folder / "manifest.csv") for folder in folders]
@@ -719,15 +694,13 @@ def join_dives(workspace: Path, dives: Sequence[Path]) -> str:
             f"depths of the dives count from different levels ({', '.join(map(repr, levels))}): "
             "import them with one --vertical-datum"
         )
-    _refuse_others(
-        workspace, [f / r.image for f, own in zip(folders, rows, strict=True) for r in own], ""
-    )
     inputs = [
         folder / name
         for folder, records in zip(folders, rows, strict=True)
         for name in ("manifest.csv", "survey.json", *(r.image for r in records))
     ]
-    stage = Stage(
+    _refuse_others(workspace, inputs, "")
+    stage = artefacts.Stage(
         name="images",
         version=2,
         command="join",
@@ -754,7 +727,7 @@ def join_dives(workspace: Path, dives: Sequence[Path]) -> str:
         ).write(partial / "survey.json")
 
     _join_plans(workspace, dives)
-    run_stage(workspace, stage, work)
+    artefacts.run_stage(workspace, stage, work)
     if (dives[0] / "survey.toml").is_file() and not (workspace / "survey.toml").exists():
         shutil.copyfile(dives[0] / "survey.toml", workspace / "survey.toml")
     counts = [len(records) for records in rows]
@@ -795,7 +768,7 @@ def _append_dive(
 
 def _join_plans(workspace: Path, dives: Sequence[Path]) -> None:
     """Write the plan of all lines over the first plan's area, where the dives were planned."""
-    folders = [dive / "plan" for dive in dives if read_stage(dive / "plan") is not None]
+    folders = [dive / "plan" for dive in dives if artefacts.read_stage(dive / "plan") is not None]
     if not folders or folders[0] != dives[0] / "plan":
         return
     plans = [read_plan(folder / "plan.json") for folder in folders]
@@ -807,14 +780,16 @@ def _join_plans(workspace: Path, dives: Sequence[Path]) -> None:
                 "survey"
             )
         whole = _with_lines(whole, plan)
-    stage = Stage(
+    stage = artefacts.Stage(
         name="plan",
         version=1,
         command="join",
         settings={"refly_of": whole.name},
         inputs=[folder / "plan.json" for folder in folders],
     )
-    run_stage(workspace, stage, lambda part: write_json(part / "plan.json", whole.to_json()))
+    artefacts.run_stage(
+        workspace, stage, lambda part: artefacts.write_json(part / "plan.json", whole.to_json())
+    )
 
 
 def _with_lines(first: Plan, second: Plan) -> Plan:

@@ -27,7 +27,7 @@ from alice_survey.core.frames import Array, distances_m
 from alice_survey.core.manifest import ImageRecord
 from alice_survey.core.records import PlaceRecord
 from camera_calib.calibrate.picture_sets import pair_pictures
-from camera_calib.picture_files import KINDS, time_taken
+from camera_calib.picture_files import time_taken
 from camera_calib.rig import Rig
 from missions.logs.dive import finite_number
 from missions.logs.navigation_csv import (
@@ -38,21 +38,7 @@ from missions.logs.navigation_csv import (
     warn_of_gaps,
 )
 from missions.logs.ros_bag import opened_bag
-from reconstruct.pictures.files import (
-    PictureFacts,
-    bits_used,
-    copy_picture,
-    decode_stored,
-    half_of,
-    inspect_shot,
-    kind_of,
-    list_names,
-    mask_names,
-    opaque_part,
-    safe_name,
-    target_suffix,
-    to_utc,
-)
+from reconstruct.pictures import files
 from reconstruct.pictures.undistorted import read_mask
 
 if TYPE_CHECKING:
@@ -211,8 +197,8 @@ def _pair_by_numbers(sides: Mapping[str, Sequence[Path]]) -> list[Mapping[str, P
     if paired and not all(whole) and all(whole[: paired[-1] + 1]):
         rest = [path.name for one in sets[paired[-1] + 1 :] for path in one.paths.values()]
         warn(
-            f"only the last pictures have no partner ({list_names(rest)}): a camera that counts "
-            "its own pictures and dropped one shifts the pairs after it; a trigger log "
+            f"only the last pictures have no partner ({files.list_names(rest)}): a camera that "
+            "counts its own pictures and dropped one shifts the pairs after it; a trigger log "
             "(--triggers) pairs by time"
         )
     return [one.paths for one in sets]
@@ -235,7 +221,7 @@ def _time_in_name(path: Path) -> float | None:
 
 def _time_in_exif(path: Path) -> float | None:
     taken = time_taken(path)
-    return None if taken is None else to_utc(taken, UTC).timestamp()
+    return None if taken is None else files.to_utc(taken, UTC).timestamp()
 
 
 def _trigger_times(
@@ -280,9 +266,10 @@ def _trigger_times(
             )
     lost = [path.name for paths in sides.values() for path in paths if path not in found]
     if not found:
-        raise ImageError(f"{triggers}: holds none of the pictures, such as {list_names(lost, 2)}")
+        raise ImageError(f"{triggers}: holds none of the pictures, such as {lost[0]}")
     if lost:
-        warn(f"{len(lost)} pictures are not in {triggers} and are left out: {list_names(lost)}")
+        names = files.list_names(lost)
+        warn(f"{len(lost)} pictures are not in {triggers} and are left out: {names}")
     return found
 
 
@@ -322,7 +309,7 @@ def take_bag(
         NavigationError: it is no bag, or damaged.
     """
     lost: Counter[str] = Counter()
-    files: dict[tuple[str, int], Path] = {}
+    written: dict[tuple[str, int], Path] = {}
     with opened_bag(bag) as reader:
         cameras = _cameras(bag, reader, topics, mono)
         times: dict[str, list[int]] = {camera: [] for camera in cameras.values()}
@@ -342,22 +329,22 @@ def take_bag(
         requested = {key for moment in moments for key in moment.values()}
         for camera, time_ns, message in _messages(reader, cameras, "pictures of the bag"):
             key = camera, time_ns
-            if key in requested and key not in files:
+            if key in requested and key not in written:
                 try:
                     suffix, data = _content(message)
                 except ValueError as error:
                     lost[f"pictures of {camera} are left out: {error}"] += 1
                     continue
                 stem = f"{time_ns // 10**9}_{time_ns % 10**9:09d}"
-                files[key] = folder / safe_name(camera) / f"{stem}{suffix}"
-                files[key].parent.mkdir(parents=True, exist_ok=True)
-                files[key].write_bytes(data)
+                written[key] = folder / files.safe_name(camera) / f"{stem}{suffix}"
+                written[key].parent.mkdir(parents=True, exist_ok=True)
+                written[key].write_bytes(data)
     for reason, count in sorted(lost.items()):
         warn(f"{bag}: {count} {reason}")
-    if not files:
+    if not written:
         raise ImageError(f"{bag}: no picture could be taken")
-    stations = [{c: files[key] for c, key in m.items() if key in files} for m in moments]
-    times_s = {path: 1e-9 * time_ns for (_, time_ns), path in files.items()}
+    stations = [{c: written[key] for c, key in m.items() if key in written} for m in moments]
+    times_s = {path: 1e-9 * time_ns for (_, time_ns), path in written.items()}
     return [station for station in stations if station], times_s
 
 
@@ -454,7 +441,7 @@ class Incoming:
     source: Path
     camera: str
     station: int
-    facts: PictureFacts
+    facts: files.PictureFacts
     image: str = ""
     mask: Path | None = None
     video_time_s: float | None = None
@@ -495,7 +482,7 @@ def find_entries(
         for station, paths in enumerate(stations)
         for camera, path in paths.items()
     ]
-    owners = {path: camera for camera, _, files in listed for path in files}
+    owners = {path: camera for camera, _, shot in listed for path in shot}
     copies = same_bytes([*owners])
     for copy, first in copies.items():
         if owners[copy] != owners[first]:
@@ -504,11 +491,12 @@ def find_entries(
                 "give each camera the pictures that it took"
             )
     listed = [one for one in listed if one[2][0] not in copies]
-    facts = executor.map(inspect_shot, [files for _, _, files in listed], label="checking pictures")
+    every = [shot for _, _, shot in listed]
+    facts = executor.map(files.inspect_shot, every, label="checking pictures")
     entries = []
     left_out = {COPIES: [copy.name for copy in copies], MIRRORED: [], UNDECODABLE: [], SHOTS: []}
-    for (camera, station, files), tried in zip(listed, facts, strict=True):
-        left_out[SHOTS] += [path.name for path in files[len(tried) :] if path not in copies]
+    for (camera, station, shot), tried in zip(listed, facts, strict=True):
+        left_out[SHOTS] += [path.name for path in shot[len(tried) :] if path not in copies]
         for known in tried:
             if known.fault:
                 warn(f"{known.path} is left out: {known.fault}")
@@ -516,7 +504,7 @@ def find_entries(
                 left_out[reason].append(known.path.name)
                 continue
             entry = Incoming(source=known.path, camera=camera, station=station, facts=known)
-            entries.append(with_time(entry, taken[files[0]]) if taken else entry)
+            entries.append(with_time(entry, taken[shot[0]]) if taken else entry)
     return entries, left_out
 
 
@@ -546,7 +534,7 @@ def with_time(entry: Incoming, time_s: float) -> Incoming:
 
 
 def camera_names(
-    facts: Sequence[PictureFacts], name: str
+    facts: Sequence[files.PictureFacts], name: str
 ) -> list[tuple[str, tuple[str, int, int], int]]:
     """Name, key and pictures of the cameras, as far as EXIF and sizes distinguish them.
 
@@ -577,11 +565,10 @@ def check_entries(entries: Sequence[Incoming], rig: Rig | None) -> None:
                 "pictures of one size only"
             )
     for name in first:
-        lenses = {entry.facts.device for entry in entries if entry.camera == name}
+        lenses = {e.facts.device or "one without EXIF" for e in entries if e.camera == name}
         if len(lenses) > 1:
-            which = list_names([lens or "one without EXIF" for lens in sorted(lenses)], 3)
-            warn(f"pictures of {name} are of {len(lenses)} cameras or zooms, which are taken for "
-                 f"one lens: {which}")  # fmt: skip
+            warn(f"pictures of {name}, which has one lens, are of {len(lenses)} cameras or zooms: "
+                 f"{files.list_names(sorted(lenses), 3)}")  # fmt: skip
     if rig is not None:
         check_rig({n: (e.facts.width_px, e.facts.height_px) for n, e in first.items()}, rig)
 
@@ -612,12 +599,12 @@ def unique_names(entries: Sequence[Incoming]) -> list[Incoming]:
         if entry.image:
             named.append(entry)
             continue
-        stem = safe_name(entry.source.stem)
-        suffix = ".png" if entry.side else target_suffix(entry.source, bits[entry.camera])
-        image, copy = f"{safe_name(entry.camera)}/{stem}{suffix}", 1
+        stem = files.safe_name(entry.source.stem)
+        suffix = ".png" if entry.side else files.target_suffix(entry.source, bits[entry.camera])
+        image, copy = f"{files.safe_name(entry.camera)}/{stem}{suffix}", 1
         while image.lower() in taken:
             copy += 1
-            image = f"{safe_name(entry.camera)}/{stem}_{copy}{suffix}"
+            image = f"{files.safe_name(entry.camera)}/{stem}_{copy}{suffix}"
         taken.add(image.lower())
         named.append(replace(entry, image=image))
     return named
@@ -628,7 +615,7 @@ def _bits(entries: Sequence[Incoming]) -> dict[str, int]:
     highest: dict[str, int] = {}
     for entry in entries:
         highest[entry.camera] = max(entry.facts.highest, highest.get(entry.camera, 0))
-    return {camera: bits_used(value) for camera, value in sorted(highest.items())}
+    return {camera: files.bits_used(value) for camera, value in sorted(highest.items())}
 
 
 def with_masks(entries: Sequence[Incoming], masks: Path | None, *, stereo: bool) -> list[Incoming]:
@@ -636,28 +623,27 @@ def with_masks(entries: Sequence[Incoming], masks: Path | None, *, stereo: bool)
 
     In a folder of masks that of `P1.JPG` may also be `P1` of any kind.
     """
-    files: dict[Path, dict[str, Path]] = {}
+    listed: dict[Path, dict[str, Path]] = {}
     found: list[Incoming] = []
     for entry in entries:
-        names, folders = mask_names(entry.source.name), [entry.source.parent]
+        names, folders = files.mask_names(entry.source.name), [entry.source.parent]
         if masks is not None:
-            ends = (end for kind in KINDS.values() for end in kind)
-            names += [f"{entry.source.stem.lower()}{end}" for end in ends]
+            names += [f"{entry.source.stem.lower()}{end}" for end in files.ENDS]
             folders = [masks / entry.camera, *([] if stereo else [masks])]
-        for folder in set(folders) - set(files):
+        for folder in set(folders) - set(listed):
             inside = sorted(folder.iterdir()) if folder.is_dir() else []
-            files[folder] = {path.name.lower(): path for path in inside}
-        named = (files[folder].get(one) for folder in folders for one in names)
+            listed[folder] = {path.name.lower(): path for path in inside}
+        named = (listed[folder].get(one) for folder in folders for one in names)
         mask = next((one for one in named if one is not None), None)
         if mask is not None:
             read_mask(mask, entry.file_px)
         found.append(replace(entry, mask=mask))
     if masks is not None:
         used = {entry.mask for entry in found} - {None}
-        there = [path for own in files.values() for path in own.values() if kind_of(path)]
+        there = [path for own in listed.values() for path in own.values() if files.kind_of(path)]
         lost = [path.name for path in there if path not in used]
         if lost or not used:
-            such = f" (not {list_names(lost, 3)})" if lost else ""
+            such = f" (not {files.list_names(lost, 3)})" if lost else ""
             warn(f"{masks}: {len(used)} of {len(there)} masks belong to a picture{such}: give them "
                  "the names of their pictures")  # fmt: skip
     cut_out = sum(entry.facts.cut_out and entry.side != SIDES[1] for entry in found)
@@ -670,7 +656,7 @@ def copy_all(entries: Sequence[Incoming], partial: Path, executor: Executor) -> 
     """Copy pictures to where their names say; what was lost in it, as notes."""
     bits = _bits(entries)
     tasks = [(e.source, partial / e.image, bits[e.camera], e.side) for e in entries]
-    for _ in executor.map(copy_picture, tasks, label="copying pictures"):
+    for _ in executor.map(files.copy_picture, tasks, label="copying pictures"):
         pass
     return [
         f"pictures of camera {camera} held {count} bits; the upper 8 were kept"
@@ -684,10 +670,11 @@ def record_of(entry: Incoming, partial: Path) -> ImageRecord:
     mask, usable = "", None
     if entry.mask is not None:
         usable = read_mask(entry.mask, entry.file_px)
-    if entry.facts.cut_out and (opaque := opaque_part(decode_stored(entry.source))) is not None:
+    if entry.facts.cut_out:
+        opaque = files.opaque_part(files.decode(entry.source, alpha=True))
         usable = opaque if usable is None else usable & opaque
     if usable is not None:
-        usable = half_of(usable, entry.side)
+        usable = files.half_of(usable, entry.side)
         mask = f"masks/{Path(entry.image).with_suffix('.png').as_posix()}"
         (partial / mask).parent.mkdir(parents=True, exist_ok=True)
         if not cv2.imwrite(str(partial / mask), usable.astype(np.uint8) * 255):
@@ -807,15 +794,17 @@ def _compare_with_exif(records: Sequence[ImageRecord], entries: Sequence[Incomin
 
 
 def _times(
-    entries: Sequence[Incoming], log: NavigationLog | None, clock_offset_s: float, zone: tzinfo
+    entries: Sequence[Incoming],
+    log: NavigationLog | None,
+    clock_offset_s: float,
+    zone: tzinfo,
 ) -> tuple[Array, str]:
     """Seconds of every picture on the clock of navigation (else since the first), NaN if unknown.
 
     Also where they count from if the clocks of pictures and log have no dates in common.
     """
-    dates = [
-        None if e.facts.time_local is None else to_utc(e.facts.time_local, zone) for e in entries
-    ]
+    local = [entry.facts.time_local for entry in entries]
+    dates = [None if time is None else files.to_utc(time, zone) for time in local]
     known = [date for date in dates if date is not None]
     log_start = None if log is None else log.start_utc
     if all(e.video_time_s is not None for e in entries) and not (log_start and known):
@@ -842,7 +831,7 @@ def _with_navigation(
     elif not has_reading.all():
         lost = [r.image for r, known in zip(records, has_reading, strict=True) if not known]
         warn(f"navigation names {len(records) - len(lost)} of {len(records)} pictures, not "
-             f"{list_names(lost)}")  # fmt: skip
+             f"{files.list_names(lost)}")  # fmt: skip
     rows = zip(*(column.tolist() for column in found.values()), strict=True)
     return [
         replace(record, **dict(zip(found, row, strict=True))) if known else record
@@ -865,5 +854,5 @@ def _with_gps(records: Sequence[ImageRecord], entries: Sequence[Incoming]) -> li
             )  # fmt: skip
         placed.append(record)
     if 0 < len(lost) < len(records):
-        warn(f"{len(lost)} pictures have no complete GPS in EXIF: {list_names(lost)}")
+        warn(f"{len(lost)} pictures have no complete GPS in EXIF: {files.list_names(lost)}")
     return placed

@@ -26,15 +26,8 @@ from alice_survey.core.contents import ordinary_file
 from alice_survey.core.errors import ImageError, note, warn
 from alice_survey.core.executor import progress
 from alice_survey.core.frames import Array
-from reconstruct.pictures.files import (
-    VIDEO,
-    PictureFacts,
-    half_of,
-    natural_key,
-    safe_name,
-    to_utc,
-)
-from reconstruct.pictures.incoming import SIDES, Incoming
+from reconstruct.pictures.files import VIDEO, PictureFacts, natural_key, safe_name, to_utc
+from reconstruct.pictures.incoming import Incoming
 from reconstruct.pictures.quality import sharpness
 
 _MIN_FIX = 3
@@ -107,6 +100,7 @@ def read_fixes(path: Path, duration_s: float) -> Fixes:
         np.isfinite(fixes[:, :4]).all(axis=1)
         & (np.abs(fixes[:, 1]) <= 90)
         & (np.abs(fixes[:, 2]) <= 180)
+        & fixes[:, 1:3].any(axis=1)  # not of 0, 0
         & (fixes[:, 5] >= _MIN_FIX)
         & (fixes[:, 6] < _MAX_DOP)
     )
@@ -693,9 +687,8 @@ def take_frames(
             frames = _frames(recording, every_s, even=True, split=split)
         for taken, frame in enumerate(frames):
             station = entries[-1].station + 1 if entries else 0
-            for own, pixels in ((camera, frame.pixels), ("right", frame.right)):
-                if pixels is None:
-                    continue
+            parts = {camera: frame.pixels} | ({} if frame.right is None else {"right": frame.right})
+            for own, pixels in parts.items():
                 image = f"{safe_name(own)}/{name}_{taken:06d}.png"
                 (folder / image).parent.mkdir(parents=True, exist_ok=True)
                 if not cv2.imwrite(str(folder / image), pixels):
@@ -742,7 +735,7 @@ def _frames(recording: Recording, step_s: float, *, even: bool, split: bool) -> 
                     continue
                 taken += 1
                 due_s = step_s * taken if even else time_s + step_s
-                left, right = (half_of(pixels, side) for side in SIDES) if split else (pixels, None)
+                left, right = np.hsplit(pixels, 2) if split else (pixels, None)
                 yield Frame(time_s=time_s, pixels=left, right=right)
         finally:
             capture.release()

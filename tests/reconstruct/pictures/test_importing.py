@@ -283,12 +283,9 @@ def test_what_alpha_leaves_out_is_masked(
     alphas = np.full((4, 48, 64), 255, np.uint8)
     alphas[1, :9], alphas[1, 9:20], alphas[2], alphas[3, :, :7] = 100, 200, 0, 0
     for number, alpha in enumerate(alphas):
-        image = Image.fromarray(np.dstack([noise(number), alpha]))
-        (tmp_path / "in").mkdir(exist_ok=True)
-        image.save(
-            tmp_path / "in" / f"{number}{suffix}",
-            **({"lossless": True} if suffix == ".webp" else {}),
-        )
+        path = tmp_path / "in" / f"{number}{suffix}"
+        path.parent.mkdir(exist_ok=True)
+        Image.fromarray(np.dstack([noise(number), alpha])).save(path, lossless=True)
     named = np.full((48, 64), 255, np.uint8)
     named[40:] = 0
     cv2.imwrite(str(tmp_path / "in" / "3_mask.png"), named)
