@@ -34,6 +34,7 @@ _EDGE_RAD = math.radians(12.0)
 """Half the width over which the edge of a beam fades."""
 _GRID = (25, 21)
 _STEPS = 97
+_DECAY = np.exp(-np.arange(1024) / 64.0)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -157,12 +158,26 @@ def beam_profile(cos_angle: float, beam_rad: float) -> float:
     """Intensity of a strobe off its axis over that on it: Lambert's cosine within a soft cone."""
     if cos_angle <= 0.0:
         return 0.0
-    t = (beam_rad + _EDGE_RAD - math.acos(min(cos_angle, 1.0))) / (2.0 * _EDGE_RAD)
+    if cos_angle >= math.cos(max(beam_rad - _EDGE_RAD, 0.0)):
+        return cos_angle  # most places: an arc cosine takes as long as the rest
+    t = (beam_rad + _EDGE_RAD - math.acos(cos_angle)) / (2.0 * _EDGE_RAD)
     t = min(max(t, 0.0), 1.0)
     return cos_angle * t * t * (3.0 - 2.0 * t)
 
 
-@compiled
+@compiled(inline="always")
+def _decay(x: float) -> float:
+    """exp(-x), for x from 0, to 2e-14 of itself."""
+    if x >= len(_DECAY) / 64.0:
+        return math.exp(-x)
+    k = np.uint32(np.int32(x * 64.0))
+    r = x - k / 64.0
+    return _DECAY[k] * (
+        1.0 - r * (1.0 - r * (1.0 / 2 - r * (1.0 / 6 - r * (1.0 / 24 - r * (1.0 / 120)))))
+    )
+
+
+@compiled(error_model="numpy")
 def add_direct(
     x: float,
     y: float,
@@ -207,35 +222,47 @@ def add_direct(
         cos_beam = -(axis[0] * vx + axis[1] * vy + axis[2] * vz) / distance
         falls = lit[k] * peak * beam_profile(cos_beam, beam_rad) * cos_in / distance2
         for channel in range(3):
-            out[channel] += falls * math.exp(-attenuation[channel] * (distance + path_m))
+            out[channel] += falls * _decay(attenuation[channel] * (distance + path_m))
 
 
 @compiled
-def backscatter_at(
-    table: Array, reach_m: float, column: float, row: float, path_m: float, out: Array
-) -> None:
-    """Look up the backscatter of a ray: linear between rays of the grid and between paths.
+def backscatter_of_row(table: Array, row: float, out: Array) -> None:
+    """Interpolate the backscatter between two rows of its grid.
 
     Args:
         table: see `CameraLight.backscatter`.
+        row: place in the grid, 0 to rows - 1.
+        out: (columns, steps, 3) W / (m^2 sr), overwritten.
+    """
+    i = min(int(row), len(table) - 2)
+    v = row - i
+    for j in range(out.shape[0]):
+        for k in range(out.shape[1]):
+            for channel in range(3):
+                out[j, k, channel] = (1.0 - v) * table[i, j, k, channel] + v * (
+                    table[i + 1, j, k, channel]
+                )
+
+
+@compiled(error_model="numpy")
+def backscatter_at(of_row: Array, reach_m: float, column: float, path_m: float, out: Array) -> None:
+    """Look up the backscatter of a ray: linear between rays of the grid and between paths.
+
+    Args:
+        of_row: what `backscatter_of_row` gave.
         reach_m: see `CameraLight`.
         column: place in the grid, 0 to columns - 1.
-        row: see column.
         path_m: along the ray; beyond the table's reach its last value counts.
         out: (3,) W / (m^2 sr), overwritten.
     """
-    rows, columns, steps, _ = table.shape
+    columns, steps, _ = of_row.shape
     step = math.sqrt(min(max(path_m / reach_m, 0.0), 1.0)) * (steps - 1)
-    i, j, k = min(int(row), rows - 2), min(int(column), columns - 2), min(int(step), steps - 2)
-    v, u, w = row - i, column - j, step - k
+    j, k = min(int(column), columns - 2), min(int(step), steps - 2)
+    u, w = column - j, step - k
     for channel in range(3):
-        total = 0.0
-        for a in range(2):
-            for b in range(2):
-                weight = (v if a else 1.0 - v) * (u if b else 1.0 - u)
-                near, far = table[i + a, j + b, k, channel], table[i + a, j + b, k + 1, channel]
-                total += weight * (near + w * (far - near))
-        out[channel] = total
+        near = (1.0 - u) * of_row[j, k, channel] + u * of_row[j + 1, k, channel]
+        far = (1.0 - u) * of_row[j, k + 1, channel] + u * of_row[j + 1, k + 1, channel]
+        out[channel] = near + w * (far - near)
 
 
 Floats = NDArray[np.float32]

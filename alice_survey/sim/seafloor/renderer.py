@@ -17,7 +17,12 @@ from scipy.spatial.transform import RigidTransform
 from alice_survey.core.compiled import compiled
 from alice_survey.core.errors import ImageError
 from alice_survey.core.frames import Array
-from alice_survey.sim.seafloor.light import CameraLight, add_direct, backscatter_at
+from alice_survey.sim.seafloor.light import (
+    CameraLight,
+    add_direct,
+    backscatter_at,
+    backscatter_of_row,
+)
 from alice_survey.sim.seafloor.terrain import Patch, Terrain
 from alice_survey.sim.seafloor.texture import Texture, mix
 from camera_calib.camera import Camera
@@ -154,6 +159,7 @@ def flat_floor_radiance(
     vignetting = _vignetting(camera, pixels)
     picture = np.zeros((*path.shape, 3), dtype=np.float32)
     normal, lit = np.array([0.0, 0.0, -1.0]), np.ones(len(light.positions_cam))
+    of_row = np.empty(light.backscatter.shape[1:])
     last = np.array(light.backscatter.shape[1::-1]) - 1
     for index in np.ndindex(*path.shape):
         direct, veil = np.zeros(3), np.zeros(3)
@@ -163,7 +169,8 @@ def flat_floor_radiance(
             light.peak_w_per_sr, light.attenuation_per_m, direct,
         )  # fmt: skip
         column, row = pixels[index] / (camera.width_px, camera.height_px) * last
-        backscatter_at(light.backscatter, light.reach_m, column, row, path[index], veil)
+        backscatter_of_row(light.backscatter, row, of_row)
+        backscatter_at(of_row, light.reach_m, column, path[index], veil)
         picture[index] = vignetting[index] * (albedo / math.pi * direct + veil)
     return picture
 
@@ -383,7 +390,7 @@ def _surface(
     return points, normals, material, footprint
 
 
-@compiled
+@compiled(error_model="numpy")
 def _shade(
     origins: Array,
     directions: Array,
@@ -411,40 +418,36 @@ def _shade(
     count = samples * samples
     normal, direct, veil = np.empty(3), np.empty(3), np.empty(3)
     grid_x, grid_y = (table.shape[1] - 1) / columns, (table.shape[0] - 1) / frame_rows
-    for pixel in range(rows * columns):
-        row, column = pixel // columns, pixel % columns
-        red, green, blue = 0.0, 0.0, 0.0
-        for k in range(count):
-            i = pixel * count + k
-            t = path[i]
-            along = np.float64(t) if t < np.inf else reach_m
-            backscatter_at(
-                table,
-                reach_m,
-                (column + 0.5) * grid_x,
-                (row + first_row + 0.5) * grid_y,
-                along,
-                veil,
-            )
-            direct[:] = 0.0
-            if t < np.inf:
-                rotation = rotations[moments[i]]
-                for a in range(3):
-                    normal[a] = (
-                        rotation[0, a] * normals[i, 0]
-                        + rotation[1, a] * normals[i, 1]
-                        + rotation[2, a] * normals[i, 2]
-                    )
-                add_direct(
-                    origins[i, 0] + along * directions[i, 0],
-                    origins[i, 1] + along * directions[i, 1],
-                    origins[i, 2] + along * directions[i, 2],
-                    normal, along, lit[pixel], strobes, axis, beam_rad, peak, attenuation, direct,
-                )  # fmt: skip
-            weight = vignetting[i] / count
-            red += weight * (albedo[i, 0] / math.pi * direct[0] + veil[0])
-            green += weight * (albedo[i, 1] / math.pi * direct[1] + veil[1])
-            blue += weight * (albedo[i, 2] / math.pi * direct[2] + veil[2])
-        picture[row, column, 0] = red
-        picture[row, column, 1] = green
-        picture[row, column, 2] = blue
+    of_row = np.empty(table.shape[1:])
+    for row in range(rows):
+        backscatter_of_row(table, (row + first_row + 0.5) * grid_y, of_row)
+        for column in range(columns):
+            pixel = row * columns + column
+            red, green, blue = 0.0, 0.0, 0.0
+            for i in range(pixel * count, (pixel + 1) * count):
+                t = path[i]
+                along = np.float64(t) if t < np.inf else reach_m
+                backscatter_at(of_row, reach_m, (column + 0.5) * grid_x, along, veil)
+                direct[:] = 0.0
+                if t < np.inf:
+                    m = moments[i]
+                    for a in range(3):
+                        normal[a] = (
+                            rotations[m, 0, a] * normals[i, 0]
+                            + rotations[m, 1, a] * normals[i, 1]
+                            + rotations[m, 2, a] * normals[i, 2]
+                        )
+                    add_direct(
+                        origins[i, 0] + along * directions[i, 0],
+                        origins[i, 1] + along * directions[i, 1],
+                        origins[i, 2] + along * directions[i, 2],
+                        normal, along, lit[pixel], strobes, axis, beam_rad, peak, attenuation,
+                        direct,
+                    )  # fmt: skip
+                weight = vignetting[i] / count
+                red += weight * (albedo[i, 0] / math.pi * direct[0] + veil[0])
+                green += weight * (albedo[i, 1] / math.pi * direct[1] + veil[1])
+                blue += weight * (albedo[i, 2] / math.pi * direct[2] + veil[2])
+            picture[row, column, 0] = red
+            picture[row, column, 1] = green
+            picture[row, column, 2] = blue

@@ -48,6 +48,31 @@ def _fade(t: np.float32) -> np.float32:
     return t * t * t * (t * (t * _F(6.0) - _F(15.0)) + _F(10.0))
 
 
+@compiled(inline="always")
+def _noise_at(
+    x: float, y: float, z: float, per_m: float, key: np.uint32
+) -> np.float32:
+    one = _F(1.0)
+    px, py, pz = x * per_m, y * per_m, z * per_m
+    ix = np.int32(np.int32(px + _SHIFT) - np.int32(_SHIFT))
+    iy = np.int32(np.int32(py + _SHIFT) - np.int32(_SHIFT))
+    iz = np.int32(np.int32(pz + _SHIFT) - np.int32(_SHIFT))
+    a, b, c = _F(px - np.float64(ix)), _F(py - np.float64(iy)), _F(pz - np.float64(iz))
+    x0, y0, z0 = _U(_U(ix) * _PRIME_X), _U(_U(iy) * _PRIME_Y), _U(_U(iz) * _PRIME_Z)
+    x1, y1, z1 = _U(x0 + _PRIME_X), _U(y0 + _PRIME_Y), _U(z0 + _PRIME_Z)
+    x0, x1 = _U(x0 ^ key), _U(x1 ^ key)
+    a1, b1, c1 = a - one, b - one, c - one
+    u, v, w = _fade(a), _fade(b), _fade(c)
+    n0, n1 = _corner(_U(x0 ^ y0 ^ z0), a, b, c), _corner(_U(x1 ^ y0 ^ z0), a1, b, c)
+    n2, n3 = _corner(_U(x0 ^ y1 ^ z0), a, b1, c), _corner(_U(x1 ^ y1 ^ z0), a1, b1, c)
+    n4, n5 = _corner(_U(x0 ^ y0 ^ z1), a, b, c1), _corner(_U(x1 ^ y0 ^ z1), a1, b, c1)
+    n6, n7 = _corner(_U(x0 ^ y1 ^ z1), a, b1, c1), _corner(_U(x1 ^ y1 ^ z1), a1, b1, c1)
+    n0, n2 = n0 + u * (n1 - n0), n2 + u * (n3 - n2)
+    n4, n6 = n4 + u * (n5 - n4), n6 + u * (n7 - n6)
+    n0, n4 = n0 + v * (n2 - n0), n4 + v * (n6 - n4)
+    return _F(2.5 / 511.5) * (n0 + w * (n4 - n0))
+
+
 @compiled(fastmath=True)
 def noise(x: Array, y: Array, z: Array, lattice_m: float, seed: int, out: Array) -> None:
     """Fill `out` with noise of standard deviation about 0.48 and mean 0.
@@ -60,52 +85,41 @@ def noise(x: Array, y: Array, z: Array, lattice_m: float, seed: int, out: Array)
         seed: 32 bits.
         out: (N,) float32.
     """
-    inverse, one = 1.0 / lattice_m, _F(1.0)
-    scale = _F(2.5 / 511.5)
-    key = _U(seed)
+    per_m, key = 1.0 / lattice_m, _U(seed)
     for i in range(out.shape[0]):
-        px, py, pz = x[i] * inverse, y[i] * inverse, z[i] * inverse
-        ix = np.int32(np.int32(px + _SHIFT) - np.int32(_SHIFT))
-        iy = np.int32(np.int32(py + _SHIFT) - np.int32(_SHIFT))
-        iz = np.int32(np.int32(pz + _SHIFT) - np.int32(_SHIFT))
-        a, b, c = _F(px - np.float64(ix)), _F(py - np.float64(iy)), _F(pz - np.float64(iz))
-        x0, y0, z0 = _U(_U(ix) * _PRIME_X), _U(_U(iy) * _PRIME_Y), _U(_U(iz) * _PRIME_Z)
-        x1, y1, z1 = _U(x0 + _PRIME_X), _U(y0 + _PRIME_Y), _U(z0 + _PRIME_Z)
-        x0, x1 = _U(x0 ^ key), _U(x1 ^ key)
-        a1, b1, c1 = a - one, b - one, c - one
-        u, v, w = _fade(a), _fade(b), _fade(c)
-        n0, n1 = _corner(_U(x0 ^ y0 ^ z0), a, b, c), _corner(_U(x1 ^ y0 ^ z0), a1, b, c)
-        n2, n3 = _corner(_U(x0 ^ y1 ^ z0), a, b1, c), _corner(_U(x1 ^ y1 ^ z0), a1, b1, c)
-        n4, n5 = _corner(_U(x0 ^ y0 ^ z1), a, b, c1), _corner(_U(x1 ^ y0 ^ z1), a1, b, c1)
-        n6, n7 = _corner(_U(x0 ^ y1 ^ z1), a, b1, c1), _corner(_U(x1 ^ y1 ^ z1), a1, b1, c1)
-        n0, n2, n4, n6 = (
-            n0 + u * (n1 - n0),
-            n2 + u * (n3 - n2),
-            n4 + u * (n5 - n4),
-            n6 + u * (n7 - n6),
-        )
-        n0, n4 = n0 + v * (n2 - n0), n4 + v * (n6 - n4)
-        out[i] = scale * (n0 + w * (n4 - n0))
+        out[i] = _noise_at(x[i], y[i], z[i], per_m, key)
 
 
-@compiled(fastmath=True)
+@compiled(fastmath=True, error_model="numpy")
 def add_octave(
-    total: Array, scratch: Array, lattice_m: float, amplitude: float, footprint_m: Array
+    total: Array,
+    x: Array,
+    y: Array,
+    z: Array,
+    lattice_m: float,
+    seed: int,
+    amplitude: float,
+    footprint_m: Array,
 ) -> None:
-    """Add `amplitude` times noise to a total, faded out where samples are too far apart for it.
+    """Add `amplitude` times `noise` to a total, faded out where samples are too far apart for it.
 
     Args:
         total: (N,) float32, changed in place.
-        scratch: (N,) what `noise` gave.
-        lattice_m: its lattice.
+        x: see `noise`, like y, z, lattice_m and seed.
+        y: see x.
+        z: see x.
+        lattice_m: see x.
+        seed: see x.
         amplitude: its weight where samples are dense.
         footprint_m: (N,) float32 distance between samples; none of the octave is left where the
             lattice is two footprints or less, all of it from four on.
     """
+    per_m, key = 1.0 / lattice_m, _U(seed)
     for i in range(total.shape[0]):
         t = _F(lattice_m) / (_F(2.0) * footprint_m[i]) - _F(1.0)
         t = min(max(t, _F(0.0)), _F(1.0))
-        total[i] += _F(amplitude) * scratch[i] * (t * t * (_F(3.0) - _F(2.0) * t))
+        weight = _F(amplitude) * (t * t * (_F(3.0) - _F(2.0) * t))
+        total[i] += weight * _noise_at(x[i], y[i], z[i], per_m, key)
 
 
 @compiled
@@ -229,13 +243,12 @@ def _step(low: float, high: float, x: float) -> float:
 def _octaves(
     table: Array, seed: int, x: Array, y: Array, z: Array, footprint: Array, out: Array
 ) -> None:
-    scratch = np.empty(len(out), np.float32)
     out[:] = np.float32(0.0)
     finest = footprint.min()
     for k in range(len(table)):
         if table[k, 0] > 2.0 * finest:
-            noise(x, y, z, table[k, 0], mix(np.uint32(seed + 101 * k)), scratch)
-            add_octave(out, scratch, table[k, 0], table[k, 1], footprint)
+            key = mix(np.uint32(seed + 101 * k))
+            add_octave(out, x, y, z, table[k, 0], key, table[k, 1], footprint)
 
 
 @compiled
@@ -247,44 +260,59 @@ def _albedo(points: Array, material: Array, footprint: Array, seed: int, out: Ar
             points[start:stop, 1].copy(),
             points[start:stop, 2].copy(),
         )
-        apart = footprint[start:stop]
+        apart, kind = footprint[start:stop], material[start:stop]
         coarse, fine = np.empty(stop - start, np.float32), np.empty(stop - start, np.float32)
         growth, hue = np.empty(stop - start, np.float32), np.empty(stop - start, np.float32)
         _octaves(_COARSE, seed, x, y, z, apart, coarse)
         _octaves(_FINE, seed + 7, x, y, z, apart, fine)
         _octaves(_GROWTH[:2], seed + 17, x, y, z, apart, hue)
-        if material[start:stop].max() > 0.001:
+        colours = np.empty((3, stop - start))
+        _sand(coarse, fine, hue, kind, colours[0], colours[1], colours[2])
+        _add_specks(x, y, z, apart, seed, fine, colours)
+        if kind.max() > 0.001:
             _octaves(_GROWTH, seed + 13, x, y, z, apart, growth)
+            for i in range(stop - start):
+                if kind[i] > 0.001:
+                    r, g, b = colours[:, i]
+                    colours[0, i], colours[1, i], colours[2, i] = _stone(
+                        kind[i], coarse[i], fine[i], growth[i], hue[i], r, g, b
+                    )
         for i in range(stop - start):
-            at = start + i
-            kind = material[at]
-            if kind > 1.5:
-                level = 1.0 + 0.12 * coarse[i] + 0.4 * fine[i]
-                r, g, b = (0.46 + 0.03 * hue[i]) * level, 0.255 * level, 0.158 * level
-                silt = 0.55 * _step(-0.4, 0.7, hue[i] + 0.8 * fine[i])
-                r, g, b = r + silt * (0.36 - r), g + silt * (0.30 - g), b + silt * (0.215 - b)
-                turf = 0.6 * _step(0.1, 0.8, growth[i] + 0.5 * fine[i])
-                r, g, b = r + turf * (0.13 - r), g + turf * (0.135 - g), b + turf * (0.07 - b)
-                worms = 0.6 * _step(0.65, 1.0, 0.6 * fine[i] - growth[i])
-                r, g, b = r + worms * (0.62 - r), g + worms * (0.58 - g), b + worms * (0.50 - b)
-            else:
-                film = 0.45 * _step(0.1, 0.75, coarse[i] + 0.25 * hue[i] - 0.2 * fine[i])
-                detritus = max(-kind, 0.0) - 0.5 * fine[i] + 0.35 * coarse[i]
-                film = max(film, 0.6 * _step(0.2, 1.1, detritus))
-                level = 1.0 + 0.12 * coarse[i] + 0.30 * fine[i]
-                r = level * (0.41 + 0.035 * hue[i]) * (1.0 - film * 0.62)
-                g = level * 0.355 * (1.0 - film * 0.52)
-                b = level * (0.262 - 0.03 * hue[i]) * (1.0 - film * 0.55)
-                # The edge of a stone is ragged, not the smooth contour of the grid.
-                stone = _step(0.44, 0.56, kind + 0.3 * fine[i]) if kind > 0.001 else 0.0
-                if stone < 1.0:
-                    r, g, b = _add_specks(x[i], y[i], z[i], apart[i], seed, fine[i], r, g, b)
-                if stone > 0.0:
-                    rr, rg, rb = _rock(coarse[i], fine[i], growth[i], hue[i])
-                    r, g, b = r + stone * (rr - r), g + stone * (rg - g), b + stone * (rb - b)
-            out[at, 0] = min(max(r, 0.01), 0.95)
-            out[at, 1] = min(max(g, 0.01), 0.95)
-            out[at, 2] = min(max(b, 0.01), 0.95)
+            for channel in range(3):
+                out[start + i, channel] = min(max(colours[channel, i], 0.01), 0.95)
+
+
+@compiled
+def _sand(
+    coarse: Array, fine: Array, hue: Array, kind: Array, red: Array, green: Array, blue: Array
+) -> None:
+    for i in range(len(coarse)):
+        film = 0.45 * _step(0.1, 0.75, coarse[i] + 0.25 * hue[i] - 0.2 * fine[i])
+        detritus = max(-kind[i], 0.0) - 0.5 * fine[i] + 0.35 * coarse[i]
+        film = max(film, 0.6 * _step(0.2, 1.1, detritus))
+        level = 1.0 + 0.12 * coarse[i] + 0.30 * fine[i]
+        red[i] = level * (0.41 + 0.035 * hue[i]) * (1.0 - film * 0.62)
+        green[i] = level * 0.355 * (1.0 - film * 0.52)
+        blue[i] = level * (0.262 - 0.03 * hue[i]) * (1.0 - film * 0.55)
+
+
+@compiled(inline="always")
+def _stone(
+    kind: float, coarse: float, fine: float, growth: float, hue: float, r: float, g: float, b: float
+) -> tuple[float, float, float]:
+    if kind > 1.5:
+        level = 1.0 + 0.12 * coarse + 0.4 * fine
+        r, g, b = (0.46 + 0.03 * hue) * level, 0.255 * level, 0.158 * level
+        silt = 0.55 * _step(-0.4, 0.7, hue + 0.8 * fine)
+        r, g, b = r + silt * (0.36 - r), g + silt * (0.30 - g), b + silt * (0.215 - b)
+        turf = 0.6 * _step(0.1, 0.8, growth + 0.5 * fine)
+        r, g, b = r + turf * (0.13 - r), g + turf * (0.135 - g), b + turf * (0.07 - b)
+        worms = 0.6 * _step(0.65, 1.0, 0.6 * fine - growth)
+        return r + worms * (0.62 - r), g + worms * (0.58 - g), b + worms * (0.50 - b)
+    # The edge of a stone is ragged, not the smooth contour of the grid.
+    stone = _step(0.44, 0.56, kind + 0.3 * fine)
+    rr, rg, rb = _rock(coarse, fine, growth, hue)
+    return r + stone * (rr - r), g + stone * (rg - g), b + stone * (rb - b)
 
 
 @compiled(inline="always")
@@ -307,37 +335,70 @@ def _rock(coarse: float, fine: float, growth: float, hue: float) -> tuple[float,
     )
 
 
-@compiled(inline="always")
+@compiled
 def _add_specks(
-    x: float, y: float, z: float, apart: float, seed: int, fine: float, r: float, g: float, b: float
-) -> tuple[float, float, float]:
+    x: Array, y: Array, z: Array, apart: Array, seed: int, fine: Array, colours: Array
+) -> None:
+    near = np.empty(len(x), np.bool_)
+    finest = apart.min()
     for k in range(len(_SPECKS)):
-        if _SPECKS[k, 0] < 3.0 * apart:
+        cell_m, share, key = _SPECKS[k, 0], _SPECKS[k, 1], np.uint32(seed + 31 * k + 1000)
+        if cell_m < 3.0 * finest:
             continue
-        cover, back, gloom, own = speck(
-            x,
-            y,
-            z,
-            _SPECKS[k, 0],
-            _SPECKS[k, 1],
-            apart,
-            0.2 * abs(fine),
-            np.uint32(seed + 31 * k + 1000),
-        )
-        if gloom > 0.0:
-            shade = 1.0 - 0.45 * gloom
-            r, g, b = r * shade, g * shade, b * shade
-        if cover > 0.0:
-            tone = 0.6 + 0.6 * ((own >> np.uint32(4)) & np.uint32(255)) / 255.0
-            tone *= (0.45 + 0.55 * back) * (1.0 + 0.3 * fine)
-            sort = own & np.uint32(15)
-            if sort < 6:  # shell
-                sr, sg, sb = 0.68 * tone, 0.63 * tone, 0.54 * tone
-            elif sort < 10:  # grey stone
-                sr, sg, sb = 0.23 * tone, 0.215 * tone, 0.19 * tone
-            elif sort < 14:  # brown stone
-                sr, sg, sb = 0.32 * tone, 0.25 * tone, 0.17 * tone
-            else:  # weed
-                sr, sg, sb = 0.13 * tone, 0.145 * tone, 0.07 * tone
-            r, g, b = r + cover * (sr - r), g + cover * (sg - g), b + cover * (sb - b)
-    return r, g, b
+        _near_specks(x, y, z, cell_m, share, apart, key, near)
+        for i in np.flatnonzero(near):
+            if cell_m < 3.0 * apart[i]:
+                continue
+            cover, back, gloom, own = speck(
+                x[i], y[i], z[i], cell_m, share, apart[i], 0.2 * abs(fine[i]), key
+            )
+            r, g, b = colours[:, i]
+            if gloom > 0.0:
+                shade = 1.0 - 0.45 * gloom
+                r, g, b = r * shade, g * shade, b * shade
+            if cover > 0.0:
+                tone = 0.6 + 0.6 * ((own >> np.uint32(4)) & np.uint32(255)) / 255.0
+                tone *= (0.45 + 0.55 * back) * (1.0 + 0.3 * fine[i])
+                sort = own & np.uint32(15)
+                if sort < 6:  # shell
+                    sr, sg, sb = 0.68 * tone, 0.63 * tone, 0.54 * tone
+                elif sort < 10:  # grey stone
+                    sr, sg, sb = 0.23 * tone, 0.215 * tone, 0.19 * tone
+                elif sort < 14:  # brown stone
+                    sr, sg, sb = 0.32 * tone, 0.25 * tone, 0.17 * tone
+                else:  # weed
+                    sr, sg, sb = 0.13 * tone, 0.145 * tone, 0.07 * tone
+                r, g, b = r + cover * (sr - r), g + cover * (sg - g), b + cover * (sb - b)
+            colours[0, i], colours[1, i], colours[2, i] = r, g, b
+
+
+@compiled(fastmath=True)
+def _near_specks(
+    x: Array, y: Array, z: Array, cell_m: float, share: float, apart: Array, key: int, out: Array
+) -> None:
+    """Fill `out` with whether a place can be in what `speck` changes: a ball around the speck."""
+    per_m, limit = 1.0 / cell_m, np.int32(share * 1024.0)
+    for i in range(len(out)):
+        px, py, pz = x[i] * per_m, y[i] * per_m, z[i] * per_m
+        ix = np.int32(np.int32(px + _SHIFT) - np.int32(_SHIFT))
+        iy = np.int32(np.int32(py + _SHIFT) - np.int32(_SHIFT))
+        iz = np.int32(np.int32(pz + _SHIFT) - np.int32(_SHIFT))
+        h = _U(_U(ix) * _PRIME_X) ^ _U(_U(iy) * _PRIME_Y) ^ _U(_U(iz) * _PRIME_Z)
+        h = mix(_U(h ^ _U(key)))
+        own = mix(_U(h + _U(0x9E3779B9)))
+        size = _F(np.int32(own & _U(255))) / _F(255.0)
+        radius = _F(0.06) + _F(0.2) * size * size
+        long = _F(1.0) + _F(0.6 / 255.0) * _F(np.int32((own >> _U(8)) & _U(255)))
+        room = _F(1.0) - min(_F(2.6) * radius * long, _F(1.0))
+        dx = _F(px - np.float64(ix)) - _F(0.5) - room * (_centre(h >> _U(10)))
+        dy = _F(py - np.float64(iy)) - _F(0.5) - room * (_centre(h >> _U(17)))
+        dz = _F(pz - np.float64(iz)) - _F(0.5) - room * (_centre(h >> _U(24)))
+        edge = max(apart[i] * _F(per_m), _F(0.06) * radius)
+        reach = _F(1.01) * long * max(_F(1.5) * radius, radius + _F(0.5) * edge)
+        held = np.int32(h & _U(1023)) <= limit
+        out[i] = held & (dx * dx + dy * dy + dz * dz < reach * reach)
+
+
+@compiled(inline="always")
+def _centre(bits: np.uint32) -> np.float32:
+    return _F(np.int32(bits & _U(127))) / _F(127.0) - _F(0.5)
