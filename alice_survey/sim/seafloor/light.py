@@ -34,7 +34,7 @@ _EDGE_RAD = math.radians(12.0)
 """Half the width over which the edge of a beam fades."""
 _GRID = (25, 21)
 _STEPS = 97
-_DECAY = np.exp(-np.arange(1024) / 64.0)
+_DECAY = np.exp(-np.arange(4096) / 64.0)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -158,18 +158,15 @@ def beam_profile(cos_angle: float, beam_rad: float) -> float:
     """Intensity of a strobe off its axis over that on it: Lambert's cosine within a soft cone."""
     if cos_angle <= 0.0:
         return 0.0
-    if cos_angle >= math.cos(max(beam_rad - _EDGE_RAD, 0.0)):
-        return cos_angle  # most places: an arc cosine takes as long as the rest
-    t = (beam_rad + _EDGE_RAD - math.acos(cos_angle)) / (2.0 * _EDGE_RAD)
+    t = (beam_rad + _EDGE_RAD - math.acos(min(cos_angle, 1.0))) / (2.0 * _EDGE_RAD)
     t = min(max(t, 0.0), 1.0)
     return cos_angle * t * t * (3.0 - 2.0 * t)
 
 
 @compiled(inline="always")
 def _decay(x: float) -> float:
-    """exp(-x), for x from 0, to 2e-14 of itself."""
-    if x >= len(_DECAY) / 64.0:
-        return math.exp(-x)
+    """exp(-x), for x from 0, to 2e-14 of itself; exp(-64) beyond that."""
+    x = min(x, 63.99)
     k = np.uint32(np.int32(x * 64.0))
     r = x - k / 64.0
     return _DECAY[k] * (
@@ -179,11 +176,9 @@ def _decay(x: float) -> float:
 
 @compiled(error_model="numpy")
 def add_direct(
-    x: float,
-    y: float,
-    z: float,
-    normal: Array,
-    path_m: float,
+    points: Array,
+    normals: Array,
+    path_m: Array,
     lit: Array,
     strobes: Array,
     axis: Array,
@@ -192,37 +187,46 @@ def add_direct(
     attenuation: Array,
     out: Array,
 ) -> None:
-    """Add what strobes send to a place, weakened on the way there and on the way to the camera.
+    """Add what strobes send to places, weakened on the way there and on the way to the camera.
 
     Irradiance of a surface is `I cos(incidence) / d^2 exp(-c d)`.
 
     Args:
-        x: place, in the frame of the strobes, metres.
-        y: see x.
-        z: see x.
-        normal: (3,) unit normal of the surface there.
-        path_m: from there to the camera.
-        lit: (S,) how much of each strobe can be seen from there, 0 to 1.
+        points: (3, N) in the frame of the strobes, metres.
+        normals: (3, N) unit normals of the surface there.
+        path_m: (N,) from there to the camera.
+        lit: (S, N) how much of each strobe can be seen from there, 0 to 1.
         strobes: (S, 3) positions.
         axis: (3,) along which they point.
         beam_rad: half the angle of their cone.
         peak: intensity on the axis, W / sr.
         attenuation: (3,) 1 / m.
-        out: (3,) W / m^2, changed in place.
+        out: (3, N) W / m^2, changed in place.
     """
+    count = points.shape[1]
+    x, y, z = points
+    nx, ny, nz = normals
+    distance, sent = np.empty(count), np.empty(count)
+    full = math.cos(max(beam_rad - _EDGE_RAD, 0.0))
+    # Each loop reads and writes few arrays, so that the compiler vectorises it.
     for k in range(len(strobes)):
-        if lit[k] <= 0.0:
-            continue
-        vx, vy, vz = strobes[k, 0] - x, strobes[k, 1] - y, strobes[k, 2] - z
-        distance2 = vx * vx + vy * vy + vz * vz
-        distance = math.sqrt(distance2)
-        cos_in = (normal[0] * vx + normal[1] * vy + normal[2] * vz) / distance
-        if cos_in <= 0.0:
-            continue
-        cos_beam = -(axis[0] * vx + axis[1] * vy + axis[2] * vz) / distance
-        falls = lit[k] * peak * beam_profile(cos_beam, beam_rad) * cos_in / distance2
+        sx, sy, sz = strobes[k]
+        for i in range(count):
+            vx, vy, vz = sx - x[i], sy - y[i], sz - z[i]
+            distance[i] = math.sqrt(vx * vx + vy * vy + vz * vz)
+        for i in range(count):
+            along = axis[0] * (x[i] - sx) + axis[1] * (y[i] - sy) + axis[2] * (z[i] - sz)
+            sent[i] = along / distance[i]
+        for i in range(count):
+            cosine = sent[i]  # most are well within the cone, where no arc cosine is needed
+            sent[i] = lit[k, i] * (cosine if cosine >= full else beam_profile(cosine, beam_rad))
+        for i in range(count):
+            along = nx[i] * (sx - x[i]) + ny[i] * (sy - y[i]) + nz[i] * (sz - z[i])
+            sent[i] *= peak * max(along, 0.0) / (distance[i] * distance[i] * distance[i])
         for channel in range(3):
-            out[channel] += falls * _decay(attenuation[channel] * (distance + path_m))
+            received, per_m = out[channel], attenuation[channel]
+            for i in range(count):
+                received[i] += sent[i] * _decay(per_m * (distance[i] + path_m[i]))
 
 
 @compiled

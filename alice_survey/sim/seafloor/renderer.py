@@ -157,21 +157,22 @@ def flat_floor_radiance(
     origins, directions = camera.unproject(pixels)
     path = (range_m - origins[..., 2]) / directions[..., 2]
     vignetting = _vignetting(camera, pixels)
-    picture = np.zeros((*path.shape, 3), dtype=np.float32)
-    normal, lit = np.array([0.0, 0.0, -1.0]), np.ones(len(light.positions_cam))
-    of_row = np.empty(light.backscatter.shape[1:])
+    points = np.moveaxis(origins + path[..., None] * directions, -1, 0).reshape(3, -1)
+    normals, lit = np.zeros(points.shape), np.ones((len(light.positions_cam), path.size))
+    normals[2] = -1.0
+    direct, veil = np.zeros((3, *path.shape)), np.empty((*path.shape, 3))
+    add_direct(
+        points, normals, path.ravel(), lit, light.positions_cam, light.axis_cam, light.beam_rad,
+        light.peak_w_per_sr, light.attenuation_per_m, direct.reshape(3, -1),
+    )  # fmt: skip
     last = np.array(light.backscatter.shape[1::-1]) - 1
+    of_row = np.empty(light.backscatter.shape[1:])
     for index in np.ndindex(*path.shape):
-        direct, veil = np.zeros(3), np.zeros(3)
-        x, y, z = origins[index] + path[index] * directions[index]
-        add_direct(
-            x, y, z, normal, path[index], lit, light.positions_cam, light.axis_cam, light.beam_rad,
-            light.peak_w_per_sr, light.attenuation_per_m, direct,
-        )  # fmt: skip
         column, row = pixels[index] / (camera.width_px, camera.height_px) * last
         backscatter_of_row(light.backscatter, row, of_row)
-        backscatter_at(of_row, light.reach_m, column, path[index], veil)
-        picture[index] = vignetting[index] * (albedo / math.pi * direct + veil)
+        backscatter_at(of_row, light.reach_m, column, path[index], veil[index])
+    received = albedo / math.pi * np.moveaxis(direct, 0, -1) + veil
+    picture: Floats = (vignetting[..., None] * received).astype(np.float32)
     return picture
 
 
@@ -416,38 +417,37 @@ def _shade(
     """Light of every ray, averaged over each pixel: direct from the strobes, and backscatter."""
     rows, columns, _ = picture.shape
     count = samples * samples
-    normal, direct, veil = np.empty(3), np.empty(3), np.empty(3)
+    rays, veil = columns * count, np.empty(3)
+    points, turned = np.empty((3, rays)), np.empty((3, rays))
+    along, seen = np.empty(rays), np.empty((len(strobes), rays))
     grid_x, grid_y = (table.shape[1] - 1) / columns, (table.shape[0] - 1) / frame_rows
     of_row = np.empty(table.shape[1:])
     for row in range(rows):
         backscatter_of_row(table, (row + first_row + 0.5) * grid_y, of_row)
+        for ray in range(rays):
+            i = row * rays + ray
+            along[ray] = path[i] if path[i] < np.inf else reach_m
+            m = moments[i]
+            for a in range(3):
+                points[a, ray] = origins[i, a] + along[ray] * directions[i, a]
+                turned[a, ray] = (
+                    rotations[m, 0, a] * normals[i, 0]
+                    + rotations[m, 1, a] * normals[i, 1]
+                    + rotations[m, 2, a] * normals[i, 2]
+                )
+            for k in range(len(strobes)):
+                seen[k, ray] = lit[i // count, k]
+        direct = np.zeros((3, rays))
+        add_direct(points, turned, along, seen, strobes, axis, beam_rad, peak, attenuation, direct)
         for column in range(columns):
-            pixel = row * columns + column
             red, green, blue = 0.0, 0.0, 0.0
-            for i in range(pixel * count, (pixel + 1) * count):
-                t = path[i]
-                along = np.float64(t) if t < np.inf else reach_m
-                backscatter_at(of_row, reach_m, (column + 0.5) * grid_x, along, veil)
-                direct[:] = 0.0
-                if t < np.inf:
-                    m = moments[i]
-                    for a in range(3):
-                        normal[a] = (
-                            rotations[m, 0, a] * normals[i, 0]
-                            + rotations[m, 1, a] * normals[i, 1]
-                            + rotations[m, 2, a] * normals[i, 2]
-                        )
-                    add_direct(
-                        origins[i, 0] + along * directions[i, 0],
-                        origins[i, 1] + along * directions[i, 1],
-                        origins[i, 2] + along * directions[i, 2],
-                        normal, along, lit[pixel], strobes, axis, beam_rad, peak, attenuation,
-                        direct,
-                    )  # fmt: skip
+            for ray in range(column * count, (column + 1) * count):
+                i = row * rays + ray
+                backscatter_at(of_row, reach_m, (column + 0.5) * grid_x, along[ray], veil)
                 weight = vignetting[i] / count
-                red += weight * (albedo[i, 0] / math.pi * direct[0] + veil[0])
-                green += weight * (albedo[i, 1] / math.pi * direct[1] + veil[1])
-                blue += weight * (albedo[i, 2] / math.pi * direct[2] + veil[2])
+                red += weight * (albedo[i, 0] / math.pi * direct[0, ray] + veil[0])
+                green += weight * (albedo[i, 1] / math.pi * direct[1, ray] + veil[1])
+                blue += weight * (albedo[i, 2] / math.pi * direct[2, ray] + veil[2])
             picture[row, column, 0] = red
             picture[row, column, 1] = green
             picture[row, column, 2] = blue

@@ -49,9 +49,7 @@ def _fade(t: np.float32) -> np.float32:
 
 
 @compiled(inline="always")
-def _noise_at(
-    x: float, y: float, z: float, per_m: float, key: np.uint32
-) -> np.float32:
+def _noise_at(x: float, y: float, z: float, per_m: float, key: np.uint32) -> np.float32:
     one = _F(1.0)
     px, py, pz = x * per_m, y * per_m, z * per_m
     ix = np.int32(np.int32(px + _SHIFT) - np.int32(_SHIFT))
