@@ -314,7 +314,12 @@ def _write_poses(
 
 def _write_picture(path: Path, picture: NDArray[Any]) -> None:
     options = {
-        ".png": [cv2.IMWRITE_PNG_COMPRESSION, 1],
+        ".png": [
+            cv2.IMWRITE_PNG_COMPRESSION,
+            1,
+            cv2.IMWRITE_PNG_STRATEGY,
+            cv2.IMWRITE_PNG_STRATEGY_RLE,
+        ],
         ".jpg": [cv2.IMWRITE_JPEG_QUALITY, 95],
         ".tif": [],
     }[path.suffix]

@@ -169,9 +169,10 @@ def _decay(x: float) -> float:
     x = min(x, 63.99)
     k = np.uint32(np.int32(x * 64.0))
     r = x - k / 64.0
-    return _DECAY[k] * (
+    left: float = _DECAY[k] * (
         1.0 - r * (1.0 - r * (1.0 / 2 - r * (1.0 / 6 - r * (1.0 / 24 - r * (1.0 / 120)))))
     )
+    return left
 
 
 @compiled(error_model="numpy")

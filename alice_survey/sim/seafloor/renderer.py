@@ -274,24 +274,72 @@ def _visible_strobes(
     import cv2
     import open3d as o3d
 
-    step = samples * samples
-    first, distance = world[::step], path[::step]
-    met = np.isfinite(distance)
-    hits = first[met, :3] + distance[met, None] * first[met, 3:]
-    at = moments[::step][met]
-    lit = np.empty((shape[0] * shape[1], len(light.positions_cam)), dtype=np.float32)
+    count = shape[0] * shape[1]
+    lit = np.ones((count, len(light.positions_cam)), dtype=np.float32)
+    rays, slope = np.empty((count, 6), np.float32), np.empty(count, np.float32)
+    cell = np.empty((count, 2), np.intp)
+    low = patch.vertices.min(axis=0)
+    steepest, cell_m = patch.steepest
     for k, strobe in enumerate(light.positions_cam):
-        # From each hit to the strobe, with the distance as the unit of length.
-        rays = np.zeros((len(first), 6), np.float32)
-        rays[:, 5] = 1.0
         aims = sum((rotations[..., axis] * strobe[axis] for axis in range(3)), start=places)
-        rays[met] = np.concatenate([hits, aims[at] - hits], axis=1)
+        within_m = _aim(world, path, moments, samples**2, aims, low, cell_m, rays, slope, cell)
+        # Ground that is nowhere as steep as the way to the strobe hides it from none of its
+        # places, up to where the way is above all there is.
+        size = 2 * min(int(within_m / cell_m) + 2, max(steepest.shape)) + 1
+        around = cv2.dilate(steepest, np.ones((size, size), np.uint8))
+        doubtful = np.flatnonzero(slope <= 1.01 * around[cell[:, 0], cell[:, 1]])
         dark = patch.scene.test_occlusions(
-            o3d.core.Tensor.from_numpy(rays), 0.002, 1.0 - 1e-4, nthreads=1
+            o3d.core.Tensor.from_numpy(rays[doubtful]), 0.002, 1.0 - 1e-4, nthreads=1
         )
-        clear = 1.0 - dark.numpy().astype(np.float32)
-        lit[:, k] = cv2.blur(clear.reshape(shape), (_SHADOW_BLUR_PX, _SHADOW_BLUR_PX)).ravel()
+        lit[doubtful, k] = ~dark.numpy()
+        lit[:, k] = cv2.blur(lit[:, k].reshape(shape), (_SHADOW_BLUR_PX, _SHADOW_BLUR_PX)).ravel()
     return lit
+
+
+@compiled(error_model="numpy")
+def _aim(
+    world: Array,
+    path: Array,
+    moments: Array,
+    step: int,
+    aims: Array,
+    low: Array,
+    cell_m: float,
+    rays: Array,
+    slope: Array,
+    cell: Array,
+) -> float:
+    """Aim at a strobe from what each `step`-th ray hits.
+
+    Args:
+        world: see `_surface`, like path.
+        path: see world.
+        moments: (N,) of the rays.
+        step: samples of a pixel.
+        aims: (T, 3) where the strobe is.
+        low: (3,) least north, east and depth of the patch.
+        cell_m: of the grid of `Patch.steepest`.
+        rays: (N / step, 6) filled, with the distance to the strobe as the unit of length.
+        slope: (N / step,) filled: of that way; NaN where nothing is hit.
+        cell: (N / step, 2) filled: row and column in the grid.
+
+    Returns:
+        Greatest distance from a hit, to the side, within which the way can be hidden.
+    """
+    within_m = 0.0
+    for ray in range(len(rays)):
+        i = ray * step
+        slope[ray], cell[ray] = np.nan, 0
+        if path[i] < np.inf:
+            for a in range(3):
+                rays[ray, a] = world[i, a] + path[i] * world[i, 3 + a]
+                rays[ray, 3 + a] = aims[moments[i], a] - rays[ray, a]
+            rise, aside = -rays[ray, 5], math.hypot(rays[ray, 3], rays[ray, 4])
+            slope[ray] = rise / aside
+            within_m = max(within_m, aside * (rays[ray, 2] - low[2]) / max(rise, 0.01))
+            for a in range(2):
+                cell[ray, a] = int((rays[ray, a] - low[a]) / cell_m)
+    return within_m
 
 
 @compiled

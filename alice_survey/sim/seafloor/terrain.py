@@ -23,6 +23,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
 from alice_survey.core.artefacts import atomic_path, read_json, write_json
+from alice_survey.core.compiled import compiled
 from alice_survey.core.config import SeafloorConfig
 from alice_survey.core.errors import ConfigError, WorkspaceError
 from alice_survey.core.frames import Array
@@ -36,6 +37,8 @@ DETRITUS, SAND, ROCK, CERAMIC = -1.0, 0.0, 1.0, 2.0
 ripples, or of rock)."""
 
 _FORMAT = {"format": "alice-survey terrain", "version": 1}
+_STEEPNESS_CELLS = 80
+"""Along the longer side of a patch."""
 _MAX_VERTICES = 60_000_000
 _SEED_STREAM = 3100
 _PLY_VERTEX = np.dtype([("xyz", "<f4", 3), ("material", "<f4")])
@@ -82,6 +85,8 @@ class Patch:
     """(V, 3) unit normals that point into the water."""
     material: Floats
     """(V,) see `DETRITUS`, `SAND`, `ROCK`, `CERAMIC`."""
+    ground: int
+    """Triangles of the height field; those of objects follow."""
     to_rest: Floats | None = None
     """(V, 3) from each vertex to where its texture is, metres; None where nothing moves."""
 
@@ -96,6 +101,37 @@ class Patch:
             o3d.core.Tensor.from_numpy(np.ascontiguousarray(self.triangles.astype(np.uint32))),
         )
         return scene
+
+    @cached_property
+    def steepest(self) -> tuple[Floats, float]:
+        """Greatest slope in cells that count from the least north and east; inf near objects."""
+        size = np.ptp(self.vertices[:, :2], axis=0)
+        cell_m = max(float(size.max()) / _STEEPNESS_CELLS, 1e-6)
+        steepest = np.zeros((size / cell_m).astype(int) + 1, np.float32)
+        _fill_steepest(self.vertices, self.triangles, self.ground, cell_m, steepest)
+        return steepest, cell_m
+
+
+@compiled
+def _fill_steepest(
+    vertices: Floats, triangles: Triangles, ground: int, cell_m: float, out: Floats
+) -> None:
+    south, west = vertices[:, 0].min(), vertices[:, 1].min()
+    for t in range(len(triangles)):
+        a, b, c = vertices[triangles[t, 0]], vertices[triangles[t, 1]], vertices[triangles[t, 2]]
+        p, q = b - a, c - a
+        north, east = p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2]
+        down = abs(p[0] * q[1] - p[1] * q[0])
+        slope = math.hypot(north, east) / down if t < ground and down > 0.0 else np.inf
+        for i in range(
+            int((min(a[0], b[0], c[0]) - south) / cell_m),
+            int((max(a[0], b[0], c[0]) - south) / cell_m) + 1,
+        ):
+            for j in range(
+                int((min(a[1], b[1], c[1]) - west) / cell_m),
+                int((max(a[1], b[1], c[1]) - west) / cell_m) + 1,
+            ):
+                out[i, j] = max(out[i, j], slope)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -213,6 +249,7 @@ class Terrain:
             triangles=np.concatenate(triangles),
             normals=np.concatenate(normals),
             material=np.concatenate(material),
+            ground=len(triangles[0]),
             to_rest=np.concatenate(to_rest) if moving else None,
         )
 

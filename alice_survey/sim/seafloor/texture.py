@@ -343,7 +343,7 @@ def _add_specks(
         cell_m, share, key = _SPECKS[k, 0], _SPECKS[k, 1], np.uint32(seed + 31 * k + 1000)
         if cell_m < 3.0 * finest:
             continue
-        _near_specks(x, y, z, cell_m, share, apart, key, near)
+        near_specks(x, y, z, cell_m, share, apart, key, near)
         for i in np.flatnonzero(near):
             if cell_m < 3.0 * apart[i]:
                 continue
@@ -371,7 +371,7 @@ def _add_specks(
 
 
 @compiled(fastmath=True)
-def _near_specks(
+def near_specks(
     x: Array, y: Array, z: Array, cell_m: float, share: float, apart: Array, key: int, out: Array
 ) -> None:
     """Fill `out` with whether a place can be in what `speck` changes: a ball around the speck."""

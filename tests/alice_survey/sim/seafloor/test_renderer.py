@@ -9,7 +9,7 @@ from alice_survey.core.config import SeafloorConfig, SurveyConfig
 from alice_survey.core.errors import WorkspaceError
 from alice_survey.core.frames import rotation_from_attitude
 from alice_survey.sim.seafloor.as_built import true_rig
-from alice_survey.sim.seafloor.light import backscatter_at, camera_light
+from alice_survey.sim.seafloor.light import backscatter_at, backscatter_of_row, camera_light
 from alice_survey.sim.seafloor.renderer import (
     Scene,
     camera_rays,
@@ -204,6 +204,25 @@ def test_an_amphora_hides_strobes_from_the_sand_next_to_it() -> None:
     assert np.median(shaded) == pytest.approx(1.0, abs=1e-4)
 
 
+def test_places_taken_as_lit_at_once_are_lit() -> None:
+    """Pictures are the same where a ray is cast to each strobe from everywhere."""
+    config = SeafloorConfig(relief_m=0.4, rocks_per_m2=3.0, grid_m=0.02)
+    laid = build_terrain(config, (-2.0, 2.0, -2.0, 2.0), FLOOR_M, np.random.default_rng(4))
+    sure, cell_m = laid.patch().steepest
+    assert 0.001 < np.isinf(sure).mean() < 0.2
+    assert np.sort(sure, axis=None)[-30] > 1.0 > np.median(sure) > 0.05
+    whole = laid.patch()
+    laid.__dict__["patch"] = lambda _: whole
+    views = [
+        pose(n, 0.1 * n, altitude, (4.0, 3.0, 0.0)) for n in (-0.4, 0.4) for altitude in (0.8, 2.0)
+    ]
+    scene = Scene(terrain=laid, texture=Even(seed=0))
+    quick = [render(scene, CAMERA, LIGHT, still(view), 1) for view in views]
+    whole.__dict__["steepest"] = np.full_like(sure, np.inf), cell_m
+    for view, picture in zip(views, quick, strict=True):
+        np.testing.assert_array_equal(render(scene, CAMERA, LIGHT, still(view), 1), picture)
+
+
 def test_vignetting_is_cosine_to_the_fourth_in_air() -> None:
     camera = design_rig(CONFIG.camera, CONFIG.water, 16).cameras["left"]
     rays = camera_rays(camera, 1, 0, camera.height_px)
@@ -248,9 +267,10 @@ def test_a_level_camera_sees_the_floor_below_the_horizon_and_backscatter_above()
     lit = render(FLAT, CAMERA, LIGHT, still(level), 1)
     row, column = 3, CAMERA.width_px // 2
     place = np.array([column + 0.5, row + 0.5]) / (CAMERA.width_px, CAMERA.height_px)
-    veil = np.empty(3)
-    last = np.array(LIGHT.backscatter.shape[1::-1]) - 1
-    backscatter_at(LIGHT.backscatter, LIGHT.reach_m, *(place * last), LIGHT.reach_m, veil)
+    veil, of_row = np.empty(3), np.empty(LIGHT.backscatter.shape[1:])
+    at = place * (np.array(LIGHT.backscatter.shape[1::-1]) - 1)
+    backscatter_of_row(LIGHT.backscatter, at[1], of_row)
+    backscatter_at(of_row, LIGHT.reach_m, at[0], LIGHT.reach_m, veil)
     cosine = CAMERA.in_air().unproject(np.array([column + 0.5, row + 0.5]))[1][2]
     np.testing.assert_allclose(lit[row, column], veil * cosine**4, rtol=1e-5)
 

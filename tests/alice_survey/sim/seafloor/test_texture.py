@@ -4,7 +4,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from alice_survey.sim.seafloor.terrain import CERAMIC, ROCK, SAND
-from alice_survey.sim.seafloor.texture import SAND_ALBEDO, Texture, add_octave, noise, speck
+from alice_survey.sim.seafloor.texture import (
+    SAND_ALBEDO,
+    Texture,
+    add_octave,
+    near_specks,
+    noise,
+    speck,
+)
 from tests.oracles_seafloor import gradient_noise
 
 PIXEL_M = 0.00042
@@ -90,9 +97,11 @@ def test_samples_do_not_alias(step_m: float) -> None:
     ("footprint_m", "left"), [(0.0025, 1.0), (0.00333, 0.5), (0.005, 0.0), (0.02, 0.0)]
 )
 def test_octaves_fade_before_samples_are_too_far_apart(footprint_m: float, left: float) -> None:
-    total, waves = np.zeros(4, dtype=np.float32), np.full(4, 0.8, dtype=np.float32)
-    add_octave(total, waves, 0.01, 0.5, np.full(4, footprint_m, dtype=np.float32))
-    np.testing.assert_allclose(total, 0.4 * left, atol=2e-3)
+    total, waves = np.zeros((2, 400), dtype=np.float32)
+    places = np.random.default_rng(2).uniform(-1.0, 1.0, (3, 400))
+    noise(*places, 0.01, 7, waves)
+    add_octave(total, *places, 0.01, 7, 0.5, np.full(400, footprint_m, dtype=np.float32))
+    np.testing.assert_allclose(total, 0.5 * left * waves, atol=2e-3)
 
 
 def test_specks_end_smoothly_within_their_cell() -> None:
@@ -106,6 +115,19 @@ def test_specks_end_smoothly_within_their_cell() -> None:
         at[:, axis] = cell_m * np.round(at[:, axis] / cell_m) + 1e-9
         assert max(covers(at)) == 0.0
     assert 0.005 < np.mean(covers(np.random.default_rng(9).uniform(-1, 1, (3000, 3)))) < 0.2
+
+
+@pytest.mark.parametrize("apart_m", [0.0002, 0.01])
+def test_no_speck_is_passed_over(apart_m: float) -> None:
+    """The quick choice of places has all that a speck changes, and few others."""
+    at = np.random.default_rng(1).uniform(-1.0, 1.0, (20_000, 3))
+    chosen = np.empty(len(at), dtype=bool)
+    apart = np.full(len(at), apart_m, dtype=np.float32)
+    near_specks(*np.ascontiguousarray(at.T), 0.032, 0.45, apart, np.uint32(5), chosen)
+    found = [speck(*p, 0.032, 0.45, apart_m, 0.0, np.uint32(5)) for p in at]
+    changed = np.array([cover > 0.0 or gloom > 0.0 for cover, _, gloom, _ in found])
+    assert np.all(chosen[changed])
+    assert 0.01 < changed.mean() < chosen.mean() < 3.0 * changed.mean()
 
 
 def test_a_place_has_one_colour_in_any_order_of_evaluation() -> None:

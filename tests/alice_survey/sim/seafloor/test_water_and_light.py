@@ -13,6 +13,7 @@ from alice_survey.sim.seafloor.light import (
     add_direct,
     backscatter_along,
     backscatter_at,
+    backscatter_of_row,
     beam_profile,
     beam_solid_angle_sr,
     camera_light,
@@ -31,10 +32,13 @@ def irradiance(
     distance_m: float, attenuation: np.ndarray = NO_LOSS, path_m: float = 0.0,
     normal: np.ndarray = UP, lit: float = 1.0,
 ) -> np.ndarray:  # fmt: skip
-    out, strobe = np.zeros(3), np.array([[0.0, 0.0, -distance_m]])
-    lit_by = np.full(1, lit)
-    add_direct(0.0, 0.0, 0.0, normal, path_m, lit_by, strobe, DOWN, 1.0, 5.0, attenuation, out)
-    return out
+    out, strobe = np.zeros((3, 1)), np.array([[0.0, 0.0, -distance_m]])
+    path, lit_by = np.full(1, path_m), np.full((1, 1), lit)
+    add_direct(
+        np.zeros((3, 1)), normal[:, None].copy(), path, lit_by, strobe, DOWN, 1.0, 5.0,
+        attenuation, out,
+    )  # fmt: skip
+    return out[:, 0]
 
 
 @settings(deadline=None)
@@ -61,10 +65,13 @@ def test_direct_light_is_that_of_its_slow_twin(
     beam, attenuation = np.deg2rad(60.0), np.array([0.4, 0.2, 0.3])
     away = np.array(point) - strobes
     profile = np.array([beam_profile(c, beam) for c in away[:, 2] / np.linalg.norm(away, axis=1)])
-    out = np.zeros(3)
-    add_direct(*point, normal, path, np.ones(2), strobes, DOWN, beam, 3.0, attenuation, out)
+    out = np.zeros((3, 1))
+    add_direct(
+        np.array(point)[:, None], normal[:, None], np.full(1, path), np.ones((2, 1)), strobes, DOWN,
+        beam, 3.0, attenuation, out,
+    )  # fmt: skip
     twin = direct_light(np.array(point), normal, path, strobes, DOWN, profile, 3.0, attenuation)
-    np.testing.assert_allclose(out, twin, rtol=1e-12)
+    np.testing.assert_allclose(out[:, 0], twin, rtol=1e-12)
 
 
 @pytest.mark.parametrize("half_angle_deg", [15.0, 45.0, 60.0, 80.0])
@@ -136,8 +143,9 @@ def test_the_table_of_backscatter_gives_the_integral_of_any_ray(camera: Camera) 
         rng.uniform([0, 0], [211, 169], (15, 2)), rng.uniform(0.5, 4, 15), strict=True
     ):
         column, row = pixel / [211, 169] * [columns - 1, rows - 1]
-        out = np.empty(3)
-        backscatter_at(light.backscatter, light.reach_m, column, row, path, out)
+        out, of_row = np.empty(3), np.empty(light.backscatter.shape[1:])
+        backscatter_of_row(light.backscatter, row, of_row)
+        backscatter_at(of_row, light.reach_m, column, path, out)
         step = np.sqrt(path / light.reach_m) * (steps - 1)
         np.testing.assert_allclose(out, grid([[row, column, step]])[0], rtol=1e-9)
         origin, direction = camera.unproject(pixel)
