@@ -166,7 +166,15 @@ def _save_bytes(sheet: Any, kind: str, dpi: float, options: dict[str, Any]) -> b
     with figure_style(), warnings.catch_warnings():
         # The name of a picture may have letters that the font lacks.
         warnings.filterwarnings("ignore", message="Glyph")
-        sheet.savefig(content, format=kind, dpi=dpi, metadata=_NO_DATES[kind], **options)
+        if kind == "png" and not options:  # `savefig` draws twice where it lays out
+            before, sheet.dpi = sheet.dpi, dpi
+            canvas = FigureCanvasAgg(sheet)
+            canvas.draw()
+            words = {"dpi": dpi, "metadata": _NO_DATES[kind], "origin": "upper"}
+            mpl.image.imsave(content, canvas.buffer_rgba(), format=kind, **words)
+            sheet.dpi = before
+        else:
+            sheet.savefig(content, format=kind, dpi=dpi, metadata=_NO_DATES[kind], **options)
     return content.getvalue()
 
 
