@@ -15,7 +15,7 @@ from filelock import FileLock, Timeout
 
 from alice_survey.app import stages as survey_stages
 from alice_survey.app.stages import finished_stages, names, spec
-from alice_survey.core.artefacts import damage, read_json, read_stage, refuse_links
+from alice_survey.core.artefacts import damage, read_json, read_stage, refuse_links, stage_command
 from alice_survey.core.config import (
     Config,
     SurveyConfig,
@@ -24,7 +24,7 @@ from alice_survey.core.config import (
     parse_config,
     settings_in,
 )
-from alice_survey.core.errors import ConfigError, WorkspaceError, warn
+from alice_survey.core.errors import ConfigError, WorkspaceError, command_line, warn
 from alice_survey.core.executor import Executor, local_executor
 from alice_survey.core.run import progress
 from alice_survey.core.settings_form import settings_template
@@ -99,7 +99,8 @@ def run(
             alike.append(change_section(alike[1], "vehicle", **steered))
             states = [spec("plan").state(workspace, one, {}) for one in alike]
             if all(state.startswith("stale") for state in states):
-                warn(f"the plan is {states[0]}; 'alice-survey plan -w {workspace}' renews it")
+                again = stage_command("plan", workspace)
+                warn(f"the plan is {states[0]}; {again!r} renews it")
         for number, stage in enumerate(map(spec, stages), 1):
             with progress.part(stage.folder, number, len(stages)):
                 flies = stage.name == "fly" and not edited_mission
@@ -196,9 +197,12 @@ def settings(workspace: Path, survey: Path | None, *, needed: bool) -> SurveyCon
             return load_config(path)
     if not needed:
         return SurveyConfig()
+    begin, real = command_line("init", workspace), stage_command("import-images", workspace)
+    if (workspace / "images.partial").exists():
+        raise ConfigError(f"an import into {workspace} has not finished: do it again, {real!r}")
     raise ConfigError(
-        f"no survey.toml in {workspace} or here: 'alice-survey init {workspace}' writes one, and "
-        "'alice-survey import-images PICTURES -w WORKSPACE' makes a survey of pictures"
+        f"no survey.toml in {workspace} or here: {begin!r} writes one, and {real!r} makes a survey "
+        "of pictures"
     )
 
 
@@ -209,6 +213,7 @@ def init_survey(
     *,
     name: str | None = None,
     values: "Values | None" = None,
+    say: Callable[[str], object] = lambda text: None,
 ) -> Path:
     """Write a commented settings file, never over one that is there.
 
@@ -218,13 +223,13 @@ def init_survey(
         area: a file with the area to survey instead of the template's.
         name: of the survey.
         values: settings instead of the template's.
+        say: takes where the area of a file lies.
 
     Raises:
-        WorkspaceError: the file exists, the folder cannot be written, or the area is missing.
+        WorkspaceError: the file exists, or the folder cannot be written.
         ConfigError: a value is not one that a survey may have.
+        PlanError: the file holds no area that can be surveyed.
     """
-    if area is not None and not area.is_file():
-        raise WorkspaceError(f"{area}: no such file")
     path = folder / "survey.toml"
     refuse_links(folder, path)
     if path.exists():
@@ -242,7 +247,17 @@ def init_survey(
         values["area"] = dict.fromkeys(rectangle, None) | {"file": named, **values.get("area", {})}
     if values:
         text = with_settings_changed(text, values)
-    parse_config(settings_in(text, "the new survey"), "the new survey")
+    config = parse_config(settings_in(text, "the new survey"), "the new survey")
+    if area is not None:
+        from missions.areas.files import UnstatedError
+        from missions.areas.survey import survey_area
+
+        try:
+            shapes = config.area.model_copy(update={"file": area})
+            say(f"area: {survey_area(shapes, turn_margin_m=3.0).place}")
+        except UnstatedError as fault:
+            begin = command_line("init", folder)
+            raise UnstatedError(f"{fault}; {begin!r} writes settings to set it in") from None
     try:
         folder.mkdir(parents=True, exist_ok=True)
         path.write_text(text, encoding="utf-8")
@@ -291,7 +306,8 @@ def workspace_status(
 ) -> tuple[str, dict[str, Any]]:
     """State of a workspace, stage by stage, and the next command."""
     if not workspace.is_dir():
-        raise WorkspaceError(f"{workspace}: no such folder; 'alice-survey init' makes one")
+        begin = command_line("init", workspace)
+        raise WorkspaceError(f"{workspace}: no such folder; {begin!r} makes one")
     imported = is_imported(workspace)
     config = settings(workspace, survey, needed=not imported)
     states = stage_states(workspace, config, verify=verify)
@@ -301,7 +317,7 @@ def workspace_status(
         took = f"{record.took_s:8.1f} s" if record else " " * 10
         rows.append(f"{stage.name:10} {stage.folder + '/':13} {states[stage.name]:32} {took}")
     pending = [name for name, state in states.items() if state != "up to date"]
-    command = f"alice-survey {spec(pending[0]).command} -w {workspace}" if pending else None
+    command = stage_command(spec(pending[0]).command, workspace) if pending else None
     after = f"next: {command}" if command else "nothing is left to do"
     return "\n".join([*rows, after]), {"stages": states, "next": command}
 

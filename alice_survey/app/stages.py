@@ -4,7 +4,7 @@ from pathlib import Path
 
 import missions.stages
 import reconstruct.stages
-from alice_survey.core.artefacts import StageRecord, read_stage
+from alice_survey.core.artefacts import StageRecord, read_stage, stage_command
 from alice_survey.core.errors import WorkspaceError
 from alice_survey.core.records import ReportRecord
 from alice_survey.core.stages import StageSpec, Summary
@@ -51,9 +51,8 @@ def table() -> str:
 
 def _report_inputs(workspace: Path) -> list[Path]:
     if not finished_stages(workspace):
-        raise WorkspaceError(
-            f"{workspace} holds nothing to report on: run 'alice-survey plan' or 'import-images'"
-        )
+        ways = (repr(stage_command(name, workspace)) for name in ("plan", "import-images"))
+        raise WorkspaceError(f"{workspace} holds nothing to report on: run {' or '.join(ways)}")
     read = [workspace / "survey.toml"]
     read += [workspace / stage.folder / path for stage in STAGES for path in stage.reported]
     read += [f for name in LOOSE_FOLDERS for f in sorted((workspace / name).rglob("*.json"))]

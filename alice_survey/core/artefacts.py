@@ -27,7 +27,14 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic_core import to_jsonable_python
 
 from alice_survey.core.contents import MAX_TEXT, as_line, first_fault, ordinary_file
-from alice_survey.core.errors import AliceError, NavigationError, WorkspaceError, warn, why
+from alice_survey.core.errors import (
+    AliceError,
+    NavigationError,
+    WorkspaceError,
+    command_line,
+    warn,
+    why,
+)
 from alice_survey.core.run import progress
 from alice_survey.core.run.resources import processor, versions, watch_meter
 
@@ -293,9 +300,16 @@ def need_stage(workspace: Path, name: str, command: str) -> Path:
     folder = workspace / name
     record = read_stage(folder)
     if record is None:
-        raise WorkspaceError(f"{folder} is not there yet; run 'alice-survey {command}' first")
+        first = stage_command(command, workspace)
+        raise WorkspaceError(f"{folder} is not there yet; run {first!r} first")
     refuse_damage(folder, record)
     return folder
+
+
+def stage_command(command: str, workspace: Path) -> str:
+    """The command that makes a stage of a workspace, as a shell takes it."""
+    given = {"import-images": ("PICTURES",), "join": ("DIVE", "DIVE")}.get(command, ())
+    return command_line(command, *given, "-w", workspace)
 
 
 def refuse_damage(folder: Path, record: StageRecord | None) -> None:
@@ -386,7 +400,9 @@ def _is_entry(path: Path, now: FileEntry, written: FileEntry) -> bool:
 
 
 def _damage_error(folder: Path, record: StageRecord, damaged: str) -> WorkspaceError:
-    again = f"'alice-survey {record.command}'" if record.command else "the command that wrote it"
+    again = "the command that wrote it"
+    if record.command:
+        again = repr(stage_command(record.command, folder.parent))
     return WorkspaceError(f"{folder}: {damaged}; run {again} again, which makes it")
 
 

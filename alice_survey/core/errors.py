@@ -4,6 +4,8 @@ import contextlib
 import errno
 import logging
 import os
+import re
+import shlex
 import stat
 import sys
 from collections.abc import Callable, Iterator
@@ -160,9 +162,25 @@ def why(error: Exception) -> str:
     """Cause of a file error, without error numbers of the operating system."""
     if isinstance(error, FileNotFoundError):
         return "no such file"
+    if isinstance(error, NotADirectoryError):
+        return "it is a file, not a folder"
     if isinstance(error, OSError) and error.strerror:
         return error.strerror.lower()
     return str(error)
+
+
+def command_line(command: str, *words: object) -> str:
+    """A command of this program as a shell takes it: what holds spaces is quoted."""
+    return shlex.join(["alice-survey", *command.split(), *map(str, words)])
+
+
+def pip_install(extra: str) -> str:
+    """The command that installs what an extra of this package names: PyPI has it all."""
+    from importlib.metadata import requires
+
+    named = [one.partition(";") for one in requires("alice-survey") or ()]
+    needed = [name.strip() for name, _, where in named if re.search(rf"['\"]{extra}['\"]", where)]
+    return shlex.join(["pip", "install", *needed])
 
 
 NOT_GOOD_ENOUGH = 3

@@ -40,6 +40,12 @@ class Datum:
     height_m: float = 0.0
     """Height of the sea surface (or of the reference level named elsewhere) above the ellipsoid."""
 
+    @property
+    def place(self) -> str:
+        """Where it is, to a kilometre: `32.82 N 34.96 E`."""
+        north, east = self.latitude_deg, self.longitude_deg
+        return f"{abs(north):.2f} {'NS'[north < 0]} {abs(east):.2f} {'EW'[east < 0]}"
+
     @cached_property
     def _ecef(self) -> Any:
         from pyproj import Transformer

@@ -25,7 +25,7 @@ from alice_survey.core.artefacts import (
     sync_folder,
 )
 from alice_survey.core.config import CameraConfig, WaterConfig
-from alice_survey.core.errors import AliceError, CalibrationError
+from alice_survey.core.errors import AliceError, CalibrationError, command_line
 from alice_survey.core.executor import Executor, local_executor
 from alice_survey.core.frames import Array
 from alice_survey.core.manifest import read_manifest
@@ -93,16 +93,16 @@ def calibrate_pictures(
 
 def _next(calibration: Calibration, task: CalibrationTask, output: Path) -> Iterator[str]:
     """Location of the results, and what to do with them."""
-    rig = shlex.quote(str(output / "rig.json"))
-    yield f"rig in {output / 'rig.json'}; read {output / 'report.html'}"
+    rig = output / "rig.json"
+    yield f"rig in {rig}; read {output / 'report.html'}"
     yield mount_line(calibration.rig)
     if calibration.rig.body_from_rig is None:
-        yield (
-            f"  state it with alice-survey camera convert {rig} {rig} --mount nadir-bow-up --lever "
-            "0.55 -0.05 0.08 --overwrite, or let a survey with navigation find it"
-        )
+        mounted = ("--mount", "nadir-bow-up", "--lever", 0.55, -0.05, 0.08, "--overwrite")
+        command = command_line("camera convert", rig, rig, *mounted)
+        yield f"  state it with {command}, or let a survey with navigation find it"
     if not task.options.water:
-        yield f"next, under water through the ports: add --water --glass MM --start {rig}"
+        more = shlex.join(["--water", "--glass", "MM", "--start", str(rig)])
+        yield f"next, under water through the ports: add {more}"
 
 
 def _check_useful(calibration: Calibration, found: Detections, output: Path) -> None:

@@ -1,12 +1,13 @@
-"""Areas in files: GeoJSON, KML, KMZ, GeoPackage, shapefile, well-known text.
+"""Areas in files: of GIS, of GPS receivers, well-known text, lists of corners.
 
-GDAL, through pyogrio, reads them; it is loaded only when a file is read, after a look at the file's
-size, kind, names and entities. Heights are left out.
+GDAL, through pyogrio, reads most of them; it is loaded only when a file is read, after a look at
+its size, kind, names and entities. Heights are left out.
 """
 
 import contextlib
 import json
 import re
+import struct
 import tempfile
 import warnings
 import zipfile
@@ -14,22 +15,28 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
+from xml.parsers import expat
 
 import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
+from alice_survey.core.artefacts import stream_csv
 from alice_survey.core.config import SHAPEFILE_SIDES, sides_of
 from alice_survey.core.contents import (
     archive_member,
     as_line,
+    is_nowhere,
+    is_unknown,
     one_line,
     opened_archive,
+    parse_number,
     xml_root_name,
 )
 from alice_survey.core.errors import PlanError, warn
 from missions.areas.crs import LOCAL, geographic_shapes, parse_crs, usable_crs
-from missions.areas.raw import RawShapes, from_geometries
+from missions.areas.raw import RawShapes, closed_as_polygons, from_geometries, from_rings
+from missions.logs.navigation_csv import USUAL_NAMES, bare_name
 
 Role = Literal["survey", "no_go", "allowed"]
 _DEEPEST = 20
@@ -40,10 +47,26 @@ MAX_CORNERS = 200_000
 _STARTS = {".gpkg": b"SQLite format 3\x00", ".shp": b"\x00\x00\x27\x0a"}
 DRIVERS = {
     ".geojson": "GeoJSON", ".json": "GeoJSON", ".kml": "KML", ".kmz": "KML", ".gpkg": "GPKG",
-    ".shp": "ESRI Shapefile", ".zip": "ESRI Shapefile",
+    ".shp": "ESRI Shapefile", ".zip": "ESRI Shapefile", ".gpx": "GPX",
 }  # fmt: skip
 """GDAL's drivers by the ending of a file."""
-SUFFIXES = (*DRIVERS, ".wkt")
+SUFFIXES = (*DRIVERS, ".csv", ".poly", ".wkt")
+_MISSIONS = (".waypoints", ".plan", ".mission")
+_DEGREES = ("latitude_deg", "longitude_deg")
+_CORNERS = {
+    "EPSG:4326": {name: USUAL_NAMES[name] for name in _DEGREES},
+    None: {"north": "northing northings y n", "east": "easting eastings x e"},
+}
+"""By coordinate system the columns of corners, y before x, and usual names of each."""
+_PARTS = ("LinearRing", "LineString", "Point", "Track", "trkseg", "rte", "wpt")
+"""Elements of KML and GPX that are a ring, a line or a point."""
+
+_GEOJSON_LEVELS = {"MultiPoint": 1, "MultiLineString": 1, "Polygon": 1, "MultiPolygon": 2}
+"""How deep in its coordinates the rings, lines and points of a geometry are."""
+
+
+class UnstatedError(PlanError):
+    """A file does not say what a setting then has to: its coordinate system, or the layer."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -74,21 +97,78 @@ def read_area_file(
             None, holds several layers while layer is None, or coordinates that cannot be.
     """
     suffix = path.suffix.lower()
+    check_file(path)
     if suffix not in SUFFIXES:
-        raise PlanError(
-            f"area: {path}: {suffix or 'no ending'!r} files are not read; those that are: "
+        fault = (
+            "a mission is a route, not an area: save the polygon itself, as .poly or .kml"
+            if suffix in _MISSIONS
+            else f"{suffix or 'no ending'!r} files are not read; those that are: "
             f"{', '.join(SUFFIXES)}"
         )
-    if suffix == ".wkt":
-        if layer is not None:
-            raise PlanError(f"area: {path}: it has no layers: leave out layer")
+        raise PlanError(f"area: {path}: {fault}")
+    if suffix in DRIVERS:
+        chosen = _choose(path, _layers(path), layer, role)
+    elif layer is not None:
+        raise PlanError(f"area: {path}: it has no layers: leave out layer")
+    elif suffix == ".wkt":
+        return read_wkt(path.name, _read_text(path), crs)
+    else:
+        chosen = _read_corners(path)
+    found = _in_wgs84(path, chosen, crs, role)
+    # GPX has no polygons; what an area to survey means by it, a setting says.
+    return closed_as_polygons(found) if suffix == ".gpx" and role != "survey" else found
+
+
+def _read_text(path: Path) -> str:
+    try:
+        return read_bytes(path).decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise PlanError(f"area: {path}: it is not text") from None
+
+
+def _read_corners(path: Path) -> _Layer:
+    """The polygon whose corners, in order, are the rows of a CSV or of Mission Planner's `.poly`.
+
+    Raises:
+        PlanError: a row holds no corner; the message names its line.
+    """
+    header, rows = list(_DEGREES), _poly_rows(path)
+    if path.suffix.lower() == ".csv":
+        header, rows = stream_csv(path, fault=PlanError)
+    bare = {bare_name(one): one for one in reversed(header)}
+    found: dict[str | None, list[str]] = {}
+    for crs, columns in _CORNERS.items():
+        names = [(bare_name(own), *usual.split()) for own, usual in columns.items()]
+        found[crs] = [bare[one] for some in names for one in [n for n in some if n in bare][:1]]
+    crs, used = next((pair for pair in found.items() if len(pair[1]) == 2), (None, []))
+    if not used:
+        raise PlanError(
+            f"area: {path}: no columns latitude_deg and longitude_deg, or north and east; it has "
+            f"{as_line(', '.join(header))}"
+        )
+    lost = [one for one in header if one and one not in used]
+    if lost:
+        warn(f"area: {path}: not read: columns {as_line(', '.join(lost))}")
+    ring = []
+    for line, row in rows:
         try:
-            text = read_bytes(path).decode("utf-8-sig")
-        except UnicodeDecodeError:
-            raise PlanError(f"area: {path}: it is not text") from None
-        return read_wkt(path.name, text, crs)
-    chosen = _choose(path, _layers(path), layer, role)
-    return _in_wgs84(path, chosen, crs, role)
+            corner = [parse_number(row[name]) for name in used]
+        except ValueError as error:
+            raise PlanError(f"area: {path} line {line}: {error}") from None
+        if any(map(is_unknown, corner)) or (crs is not None and is_nowhere(*corner)):
+            raise PlanError(f"area: {path} line {line}: {corner} stands for an unknown place")
+        ring.append(corner)
+    _refuse_corners(path.name, len(ring))
+    return _Layer(name="", shapes=from_rings(path.name, [ring], geographic=False), crs=crs)
+
+
+def _poly_rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
+    for line, text in enumerate(_read_text(path).splitlines(), 1):
+        cells = text.split()
+        if cells and not text.startswith("#"):
+            if len(cells) != 2:
+                raise PlanError(f"area: {path} line {line}: not a latitude and a longitude")
+            yield line, dict(zip(_DEGREES, cells, strict=True))
 
 
 def read_wkt(origin: str, text: str, crs: str | None) -> RawShapes:
@@ -195,7 +275,7 @@ def _gdal_layers(file: Path, shown: Path, driver: str) -> list[_Layer]:
         try:
             names = pyogrio.list_layers(file)
             for i, (name, kind) in enumerate(names.tolist()):
-                if kind is None:
+                if kind is None or (driver == "GPX" and name.endswith("_points")):
                     continue
                 info = pyogrio.read_info(file, layer=i)
                 if info["driver"].removeprefix("LIB") != driver:
@@ -215,7 +295,88 @@ def _gdal_layers(file: Path, shown: Path, driver: str) -> list[_Layer]:
     for text in dict.fromkeys(str(w.message).splitlines()[0] for w in caught):
         if not text.startswith("Non closed ring"):  # reported with its feature
             warn(f"area: {shown.name}: {text}")
+    refuse_lost_parts(file, shown, [layer.shapes for layer in layers])
     return layers
+
+
+def refuse_lost_parts(file: Path, shown: Path, read: Sequence[RawShapes]) -> None:
+    """Refuse a file of which GDAL has left out rings, lines or points.
+
+    Args:
+        file: as `gis_files` has it.
+        shown: as the user knows it.
+        read: all that was read of it.
+
+    Raises:
+        PlanError: with both numbers.
+    """
+    kind, known = DRIVERS[file.suffix], sum(one.parts for one in read)
+    if kind == "GeoJSON":
+        count = _parts_of_geojson(read_geojson(file))
+    elif kind == "ESRI Shapefile":
+        count = _parts_of_shapefile(file.read_bytes())
+    else:
+        count = known if kind == "GPKG" else _parts_of_xml(file.read_bytes())
+    if count != known:
+        raise PlanError(
+            f"area: {shown}: it holds {count} rings, lines and points, of which {known} can be "
+            "read: write it again with a GIS"
+        )
+
+
+def _parts_of_xml(content: bytes) -> int:
+    """How many elements of `_PARTS` with coordinates there are in KML or GPX."""
+    opened: list[list[Any]] = [["", False], ["", False]]
+    count = 0
+
+    def start(name: str, _: dict[str, str]) -> None:
+        name = name.rpartition(":")[2]
+        opened[-1][1] |= name in ("trkpt", "rtept")
+        opened.append([name, name == "wpt"])
+
+    def text(data: str) -> None:
+        opened[-2][1] |= opened[-1][0] in ("coordinates", "coord") and bool(data.strip())
+
+    def end(_: str) -> None:
+        nonlocal count
+        name, is_filled = opened.pop()
+        count += is_filled and name in _PARTS
+
+    parser = expat.ParserCreate()
+    parser.StartElementHandler, parser.EndElementHandler = start, end
+    parser.CharacterDataHandler = text
+    parser.Parse(content, True)  # `gis_files` has looked whether it is valid
+    return count
+
+
+def _parts_of_geojson(data: Any) -> int:
+    waiting, count = [data], 0
+    while waiting:
+        one = waiting.pop()
+        if not isinstance(one, dict):  # a feature without a place
+            continue
+        for key in ("features", "geometries"):
+            waiting += one[key] if isinstance(one.get(key), list) else []
+        waiting.append(one.get("geometry"))
+        parts = [one.get("coordinates", [])]
+        for _ in range(_GEOJSON_LEVELS.get(str(one.get("type")), 0)):
+            parts = [part for some in parts for part in (some if isinstance(some, list) else [0])]
+        count += sum(part != [] for part in parts)
+    return count
+
+
+def _parts_of_shapefile(content: bytes) -> int:
+    """By the records of a `.shp` (ESRI, "Shapefile Technical Description", 1998)."""
+    at, count = 100, 0
+    while at + 12 <= len(content):
+        (words,) = struct.unpack_from(">i", content, at + 4)
+        (kind,) = struct.unpack_from("<i", content, at + 8)
+        if kind in (1, 11, 21):
+            count += 1
+        elif kind and at + 48 <= len(content):
+            count += struct.unpack_from("<i", content, at + 44)[0]
+        at += 8 + 2 * max(words, 2)
+    return count
 
 
 def _shapes(wkb: Sequence[bytes | None], file: str, *, several: bool, layer: str) -> RawShapes:
@@ -265,10 +426,13 @@ def _choose(path: Path, layers: list[_Layer], layer: str | None, role: Role) -> 
         points = sum(len(one.shapes.points) for one in layers)
         held = f"{points} point{'s' if points > 1 else ''} only" if points else "no shapes"
         raise PlanError(f"area: {path}: it holds {held}; an area needs a polygon or a line")
+    others = [one.name for one in layers if one not in usable and not one.shapes.is_empty]
+    if others:
+        warn(f"area: {path}: not used: points of the layers {', '.join(map(repr, others))}")
     if len(usable) > 1:
         names = ", ".join(repr(one.name) for one in usable)
         cure = "set layer to one of them" if role == "survey" else "save one as a file of its own"
-        raise PlanError(f"area: {path}: shapes in the layers {names}: {cure}")
+        raise UnstatedError(f"area: {path}: shapes in the layers {names}: {cure}")
     return usable[0]
 
 
@@ -287,7 +451,7 @@ def _in_wgs84(path: Path, layer: _Layer, crs: str | None, role: Role) -> RawShap
         return layer.shapes
     if own is None or (crs is not None and not _is_map(own)):
         if crs is None:
-            raise PlanError(
+            raise UnstatedError(
                 f"area: {path}: it does not say its coordinate system: set crs, such as "
                 f"EPSG:32636, or {LOCAL!r} for metres east and north of the datum"
             )
@@ -384,13 +548,26 @@ def gis_files(path: Path) -> Iterator[list[Path]]:
                     files = unpack(archive, folder)
             else:
                 files = [_link(path, suffix, folder)]
-            if DRIVERS[suffix] == "KML":
-                root = xml_root_name(read_bytes(files[0]))
-                if root != "kml":
-                    raise ValueError(f"not KML: its first element is {root!r}")
+            kind = DRIVERS[suffix]
+            if kind in ("KML", "GPX"):
+                content = read_bytes(files[0])
+                root = xml_root_name(content)
+                if root != kind.lower():
+                    raise ValueError(f"not {kind}: its first element is {root!r}")
+                files[0].unlink()
+                files[0].write_bytes(_INNER.sub(_ring_by_ring, content))
         except ValueError as error:
             raise PlanError(f"area: {path}: {error}") from None
         yield files
+
+
+_INNER = re.compile(rb"<innerBoundaryIs>.*?</innerBoundaryIs>", re.DOTALL)
+
+
+def _ring_by_ring(inner: re.Match[bytes]) -> bytes:
+    """An inner boundary with several rings, as ArcGIS writes it, as several: GDAL reads one."""
+    between = rb"\1</innerBoundaryIs><innerBoundaryIs>\2"
+    return re.sub(rb"(</LinearRing>\s*)(<LinearRing)", between, inner[0])
 
 
 def _link(path: Path, suffix: str, folder: Path) -> Path:

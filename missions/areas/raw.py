@@ -48,6 +48,11 @@ class RawShapes:
         return np.concatenate([*rings, *self.lines, self.points])
 
     @property
+    def parts(self) -> int:
+        """How many rings, lines and points there are."""
+        return sum(map(len, self.polygons)) + len(self.lines) + len(self.points)
+
+    @property
     def is_empty(self) -> bool:
         """Whether there is neither a polygon, a line nor a point."""
         return not (self.polygons or self.lines or len(self.points))
@@ -78,6 +83,13 @@ class RawShapes:
     def line_name(self, line: int) -> str:
         """Such as `line 2`."""
         return f"line {line + 1}" if len(self.lines) > 1 else "line"
+
+
+def closed_as_polygons(raw: RawShapes) -> RawShapes:
+    """The shapes with lines that close as polygons."""
+    rings = [line for line in raw.lines if is_closed(line)]
+    lines = tuple(line for line in raw.lines if not is_closed(line))
+    return replace(raw, lines=lines, polygons=(*raw.polygons, *((ring,) for ring in rings)))
 
 
 def no_points() -> Array:
@@ -118,7 +130,7 @@ def from_geometries(origin: str, geometries: Iterable[BaseGeometry]) -> RawShape
         if geometry is None or geometry.is_empty:
             continue
         if geometry.geom_type == "Polygon":
-            rings = shapely.get_rings(geometry).tolist()
+            rings = [ring for ring in shapely.get_rings(geometry).tolist() if not ring.is_empty]
             polygons.append(tuple(corners(ring) for ring in rings))
         elif geometry.geom_type in ("LineString", "LinearRing"):
             lines.append(corners(geometry))

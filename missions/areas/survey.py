@@ -14,7 +14,7 @@ from alice_survey.core.errors import PlanError, warn
 from alice_survey.core.frames import Array, Datum
 from missions.areas.crs import LocalFrame, middle
 from missions.areas.files import Role, read_area_file, read_wkt
-from missions.areas.raw import RawShapes, from_rings, is_closed, no_points
+from missions.areas.raw import RawShapes, closed_as_polygons, from_rings, is_closed, no_points
 from missions.values.area import Area, multipolygon
 
 SAME_PLACE_M = 1e-3
@@ -302,10 +302,16 @@ def _with_closed_lines(raw: RawShapes, settings: AreaConfig) -> RawShapes:
     drawn = settings.file is not None or settings.wkt is not None
     if not (ours and drawn) or settings.closed_lines == "corridor":
         return raw
-    if settings.closed_lines == "inside":
-        lines = tuple(line for line in raw.lines if not is_closed(line))
-        return replace(raw, lines=lines, polygons=(*raw.polygons, *((line,) for line in ours)))
     what = "a line that closes is" if len(ours) == 1 else f"{len(ours)} lines that close are"
+    is_gpx = settings.file is not None and settings.file.suffix.lower() == ".gpx"
+    if settings.closed_lines is None and is_gpx:
+        warn(
+            f"area: {raw.origin}: {what} the edge of the area, since GPX has no polygons: set "
+            "area.closed_lines = 'corridor' if the line itself is meant, or 'inside'"
+        )
+        return closed_as_polygons(raw)
+    if settings.closed_lines == "inside":
+        return closed_as_polygons(raw)
     warn(
         f"area: {raw.origin}: {what} surveyed as a corridor of {settings.corridor_width_m:g} m "
         "along the line, not what lies inside: set area.closed_lines = 'inside' for that, or "

@@ -32,7 +32,7 @@ _RANGES = {
     "altitude_m": (-10.0, 11_000.0), "heading_deg": (-360.0, 720.0), "roll_deg": (-360.0, 360.0),
     "pitch_deg": (-360.0, 360.0),
 }  # fmt: skip
-_USUAL: Mapping[str, str] = {
+USUAL_NAMES: Mapping[str, str] = {
     "latitude_deg": "latitude lat y/latitude gps_latitude gpslatitude",
     "longitude_deg": "longitude lon long lng x/longitude gps_longitude gpslongitude",
     "depth_m": "depth water_depth vehicle_depth sample_depth",
@@ -187,9 +187,9 @@ def _usual_columns(path: Path, header: Sequence[str], *, by_picture: bool) -> di
     """
     own = (*COLUMNS, "time_s", "time_utc", IMAGE)
     found = {name: name for name in own if name in header}
-    bare = {name: _bare(name) for name in header}
+    bare = {name: bare_name(name) for name in header}
     others = {bare[name]: name for name in reversed(bare) if name not in found}
-    for name, usual in _USUAL.items():
+    for name, usual in USUAL_NAMES.items():
         for one in usual.split():
             if name not in found and one in others:
                 found[name] = others.pop(one)
@@ -205,7 +205,7 @@ def _usual_columns(path: Path, header: Sequence[str], *, by_picture: bool) -> di
         found.setdefault("time_utc", found[_DAY])
     lost = [one for one in bare if one and one not in found.values()]
     if lost:
-        names = [name for name in (*own, *_USUAL) if name not in found]
+        names = [name for name in (*own, *USUAL_NAMES) if name not in found]
         near = (difflib.get_close_matches(bare[one], names, 1) for one in lost[:100])
         meant = dict.fromkeys(name for some in near for name in some)
         if {"east", "north", "easting", "northing"} & set(bare.values()):
@@ -215,7 +215,7 @@ def _usual_columns(path: Path, header: Sequence[str], *, by_picture: bool) -> di
     return found
 
 
-def _bare(name: str) -> str:
+def bare_name(name: str) -> str:
     """A column's name without case, unit and marks; whole where the unit is another than ours."""
     if re.search(r"[(\[]\s*(ft|feet|fsw|[cmk]m|rad|ms)\b", name, re.IGNORECASE):
         return name.lower()

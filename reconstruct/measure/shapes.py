@@ -18,7 +18,8 @@ from alice_survey.core.errors import ConfigError, ReconstructionError, Workspace
 from alice_survey.core.frames import Array
 from alice_survey.core.products import MOSAIC
 from alice_survey.core.run import progress
-from missions.areas.files import DRIVERS, gis_files
+from missions.areas.files import DRIVERS, gis_files, refuse_lost_parts
+from missions.areas.raw import from_geometries
 from reconstruct.measure.areas import (
     GridPart,
     PolygonOnGrid,
@@ -484,8 +485,9 @@ def read_polygons(
         PlanError: the file is damaged, too large or of another kind.
         WorkspaceError: it holds no polygon, or has no such attribute.
     """
-    if file.suffix.lower() not in DRIVERS:
-        raise WorkspaceError(f"{file}: polygons are read from {', '.join(DRIVERS)}")
+    kinds = [kind for kind in DRIVERS if kind != ".gpx"]  # it has no polygons
+    if file.suffix.lower() not in kinds:
+        raise WorkspaceError(f"{file}: polygons are read from {', '.join(kinds)}")
     with gis_files(file) as parts:
         found = [one for part in parts for one in _layers(part, file, surface, label)]
     if not found:
@@ -515,15 +517,16 @@ def _layers(
             ]
         except (DataSourceError, DataLayerError, UnicodeDecodeError, ValueError) as error:
             raise WorkspaceError(f"{shown}: cannot be read: {one_line(error)}") from None
-        for about, _, shapes, columns in layers:
+        read = [shapely.from_wkb(layer[2], on_invalid="fix") for layer in layers]
+        refuse_lost_parts(part, shown, [from_geometries(shown.name, shapes) for shapes in read])
+        for (about, _, _, columns), shapes in zip(layers, read, strict=True):
             fields = {field.lower(): n for n, field in enumerate(about["fields"].tolist())}
             if label is not None and label.lower() not in fields:
                 known = ", ".join(fields) or "none"
                 raise WorkspaceError(f"{shown}: no attribute {label!r}; there are {known}")
             names = _LABELS if label is None else (label.lower(),)
             column = next((columns[fields[name]] for name in names if name in fields), None)
-            read = shapely.make_valid(shapely.from_wkb(shapes, on_invalid="fix"))
-            for number, geometry in enumerate(read):
+            for number, geometry in enumerate(shapely.make_valid(shapes)):
                 parts = shapely.get_parts(shapely.get_parts(geometry))
                 areal = [one for one in parts if one.geom_type == "Polygon" and one.area > 0]
                 if not areal:

@@ -27,6 +27,7 @@ from alice_survey.core.errors import (
     PlanError,
     WorkspaceError,
     keep_warnings,
+    why,
 )
 from alice_survey.core.executor import SERIAL, Executor
 from alice_survey.core.manifest import ImageRecord, read_manifest, write_manifest
@@ -404,7 +405,7 @@ def cameras_in(folder: Path) -> dict[str, Path]:
             if path.is_dir() and not path.is_symlink()
         }
     except OSError as error:
-        raise ImageError(f"{folder}: cannot be read: {error.strerror}") from None
+        raise ImageError(f"{folder}: cannot be read: {why(error)}") from None
     counts = {name: count for name, count in counts.items() if count}
     if not 2 <= len(counts) <= _MAX_CAMERAS:
         return {}

@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import typer
-from pydantic import BaseModel, ConfigDict, Field, PrivateAttr
+from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, field_validator
 
-from alice_survey.core.errors import ConfigError, note
+from alice_survey.core.errors import ConfigError, note, pip_install
 
 if TYPE_CHECKING:
     from alice_survey.core.executor import Executor
@@ -143,6 +143,13 @@ class WorkspaceCommand(CommandModel):
         WORK, "Folder that holds the stages of one survey.", "-w", "--workspace"
     )
 
+    @field_validator("workspace")
+    @classmethod
+    def _no_file(cls, workspace: Path) -> Path:
+        if workspace.exists() and not workspace.is_dir():
+            raise ValueError(f"{workspace} is a file, not the folder of a survey")
+        return workspace
+
 
 class SurveyCommand(WorkspaceCommand, ReportCommand):
     """A command that reads the settings of a survey."""
@@ -227,7 +234,7 @@ def is_gpu_chosen(choice: Choice) -> bool:
     if choice == "cpu":
         return False
     if find_spec("numba_cuda") is None:
-        name, missing = None, "install 'alice-survey[gpu]'"
+        name, missing = None, pip_install("gpu")
     else:
         name, missing = _first_gpu()
     if name is not None:
@@ -244,8 +251,8 @@ def _first_gpu() -> tuple[str | None, str]:
     try:
         from numba import cuda
     except ImportError as error:
-        return None, f"numba-cuda cannot be loaded ({error}): install 'alice-survey[gpu]' again"
+        return None, f"numba-cuda cannot be loaded ({error}): {pip_install('gpu')}"
     if not cuda.is_available():
         why = " ".join(str(cuda.cuda_error() or "no NVVM").split())
-        return None, f"no NVIDIA GPU answers ({why}): install its driver, or 'alice-survey[gpu]'"
+        return None, f"no NVIDIA GPU answers ({why}): install its driver; {pip_install('gpu')}"
     return getattr(cuda.gpus[0], "name", "simulated"), ""  # numba's simulator has no name

@@ -15,7 +15,7 @@ from alice_survey.app.commands.base import (
     argument,
     option,
 )
-from alice_survey.core.errors import ConfigError
+from alice_survey.core.errors import ConfigError, command_line
 
 
 class ImportImagesCommand(WorkspaceCommand, ThreadsCommand):
@@ -110,8 +110,8 @@ class ImportImagesCommand(WorkspaceCommand, ThreadsCommand):
                 executor=self.executor(),
             )  # fmt: skip
         typer.echo(
-            f"{found}\nin {self.workspace / 'images'}; next: alice-survey reconstruct -w "
-            f"{self.workspace}"
+            f"{found}\nin {self.workspace / 'images'}; next: "
+            f"{command_line('reconstruct', '-w', self.workspace)}"
         )
 
 
@@ -131,8 +131,8 @@ class JoinCommand(WorkspaceCommand):
 
         found = join_dives(self.workspace, self.dives)
         typer.echo(
-            f"{found}\nin {self.workspace / 'images'}; next: alice-survey reconstruct -w "
-            f"{self.workspace}"
+            f"{found}\nin {self.workspace / 'images'}; next: "
+            f"{command_line('reconstruct', '-w', self.workspace)}"
         )
 
 
@@ -165,7 +165,8 @@ class ImportControlCommand(WorkspaceCommand):
             heights=self.heights, overwrite=self.overwrite,
         )  # fmt: skip
         typer.echo(
-            f"{found}\nin {self.workspace}; next: alice-survey reconstruct -w {self.workspace}"
+            f"{found}\nin {self.workspace}; next: "
+            f"{command_line('reconstruct', '-w', self.workspace)}"
         )
 
 

@@ -18,6 +18,7 @@ from alice_survey.app.commands.base import (
     argument,
     option,
 )
+from alice_survey.core.errors import command_line
 
 
 class InitCommand(WorkspaceCommand):
@@ -32,7 +33,9 @@ class InitCommand(WorkspaceCommand):
         "init harbour --example caesarea",
     )
     area: Path | None = option(
-        None, "GeoJSON, KML, KMZ, GeoPackage, shapefile or WKT of the area.", metavar="FILE"
+        None,
+        "GeoJSON, KML, GPX, GeoPackage, shapefile, WKT or corners of the area.",
+        metavar="FILE",
     )
     example: Literal["demo", "caesarea"] | None = option(None, "A ready survey instead.")
 
@@ -40,8 +43,9 @@ class InitCommand(WorkspaceCommand):
         """Write it."""
         from alice_survey.app.pipeline import init_survey
 
-        path = init_survey(self.workspace, f"{self.example or 'survey'}.toml", self.area)
-        typer.echo(f"wrote {path}; next: alice-survey plan -w {self.workspace}")
+        template = f"{self.example or 'survey'}.toml"
+        path = init_survey(self.workspace, template, self.area, say=typer.echo)
+        typer.echo(f"wrote {path}; next: {command_line('plan', '-w', self.workspace)}")
 
 
 class FovCommand(ReportCommand):

@@ -47,11 +47,10 @@ try:
         WorkspaceFiles,
     )
 except ImportError as missing:
-    from alice_survey.core.errors import WorkspaceError
+    from alice_survey.core.errors import WorkspaceError, pip_install
 
     raise WorkspaceError(
-        f"the studio needs {missing.name}, which is not installed: "
-        "pip install 'alice-survey[studio]'"
+        f"the studio needs {missing.name}, which is not installed: {pip_install('studio')}"
     ) from None
 
 from alice_survey.app.studio import endpoints

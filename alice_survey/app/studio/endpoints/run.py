@@ -30,7 +30,7 @@ from alice_survey.core.stages import StageSpec, is_imported
 
 UP_TO_DATE = "up to date"
 _STALE = re.compile(r"stale \((.*)\)", re.DOTALL)
-_COMMAND = re.compile(r"'alice-survey ([a-z][a-z -]*[a-z])( [^']*)?'")
+_COMMAND = re.compile(r"""(['"])alice-survey ([a-z][a-z -]*[a-z])( .*?)?\1""")
 _NOT_THERE = ("missing", "interrupted")
 _SIMULATED = ("run", "plan", "fly", "image", "calibrate", "evaluate")
 """Commands for simulated surveys."""
@@ -70,10 +70,10 @@ def ways_on(line: str) -> list[dict[str, Any]]:
     """Commands that a line of a fault names, and whether the studio starts them."""
     found = {}
     for match in _COMMAND.finditer(line):
-        words = match[1].split(" -")[0]
+        words = match[2].split(" -")[0]
         name = next((n for n in (words, words.split()[0]) if n in OFFERED), None)
         found[match[0]] = {
-            "command": match[0].strip("'"),
+            "command": match[0][1:-1],
             "name": None if name == "import-images" else name,
             "title": "" if name is None else OFFERED[name].title,
         }

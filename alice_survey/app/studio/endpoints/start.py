@@ -16,11 +16,10 @@ from alice_survey.app.pipeline import init_survey
 from alice_survey.app.studio.endpoints.base import Call, Endpoint, Studio
 from alice_survey.app.studio.jobs import command_of
 from alice_survey.core.artefacts import StaleError, json_values, refuse_links
-from alice_survey.core.config import Config, load_config
+from alice_survey.core.config import Config
 from alice_survey.core.errors import AliceError, WorkspaceError, why
 from alice_survey.core.settings_text import Values
 from missions.areas.files import SUFFIXES
-from missions.areas.survey import survey_area
 from reconstruct.pictures.files import VIDEO, kind_of
 from reconstruct.pictures.importing import cameras_in, preview_import
 
@@ -229,8 +228,6 @@ class _StartPage:
         try:
             area.write_bytes(content)
             init_survey(folder, area=area, name=name, values=values)
-            config = load_config(toml)
-            survey_area(config.area, turn_margin_m=3.0)
         except BaseException:
             toml.unlink(missing_ok=True)
             area.unlink(missing_ok=True)
