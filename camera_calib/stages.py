@@ -5,6 +5,7 @@ from pathlib import Path
 from alice_survey.core.artefacts import read_json
 from alice_survey.core.records import CalibrationRecord
 from alice_survey.core.stages import StageSpec, Summary, without
+from alice_survey.kit.words import count
 
 
 def _calibrate_inputs(workspace: Path) -> list[Path]:
@@ -16,7 +17,7 @@ def _calibrate_inputs(workspace: Path) -> list[Path]:
 def _calibrate_summary(folder: Path) -> Summary:
     found = CalibrationRecord.read(folder / "calibration.json")
     text = (
-        f"{found.views} views, {found.rms_px:.3f} px rms; rig in {folder / 'rig.json'}, "
+        f"{count(found.views, 'view')}, {found.rms_px:.3f} px rms; rig in {folder / 'rig.json'}, "
         f"report in {folder / 'report.html'}"
     )
     return text, {"views": found.views, "rms_px": found.rms_px, "worst_px": found.worst_px}

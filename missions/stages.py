@@ -6,19 +6,20 @@ Nothing here imports the modules that do the work: they are named, and loaded wh
 from pathlib import Path
 
 from alice_survey.core.artefacts import read_json
+from alice_survey.core.frames import Datum
 from alice_survey.core.manifest import read_manifest
 from alice_survey.core.records import BoardRecord, FlightRecord
 from alice_survey.core.stages import WHOLE, StageSpec, Summary, only, without
-from alice_survey.kit.words import share
+from alice_survey.kit.words import count, share
 
 
 def _plan_summary(folder: Path) -> Summary:
     plan = read_json(folder / "plan.json")
-    dives = len(plan["dives"])
+    lines, dives = count(len(plan["lines"]), "line"), count(len(plan["dives"]), "dive")
     text = (
-        f"{len(plan['lines'])} lines, {plan['stations']} stations, {plan['length_m']:.0f} m, "
-        f"{plan['duration_s'] / 60:.0f} min, {plan['energy_wh']:.0f} Wh in {dives} "
-        f"dive{'s' if dives > 1 else ''}; overlap {plan['forward_overlap']:.0%} forward, "
+        f"at {Datum(**plan['datum']).place}: {lines}, {count(plan['stations'], 'station')}, "
+        f"{plan['length_m']:.0f} m, {plan['duration_s'] / 60:.0f} min, {plan['energy_wh']:.0f} Wh "
+        f"in {dives}; overlap {plan['forward_overlap']:.0%} forward, "
         f"{plan['side_overlap']:.0%} side, {share(plan['coverage'])} covered as requested; "
         f"a picture every {plan['interval_s']:.2f} s, exposed {1e3 * plan['exposure_s']:.2g} ms; "
         f"map in {folder / 'map.png'}, files for vehicles in {folder / 'exports'}"
@@ -92,8 +93,8 @@ def _image_inputs(workspace: Path) -> list[Path]:
 
 
 def _pictures_summary(folder: Path) -> Summary:
-    count = len(read_manifest(folder / "manifest.csv"))
-    return f"{count} pictures in {folder}", {"pictures": count}
+    pictures = len(read_manifest(folder / "manifest.csv"))
+    return f"{count(pictures, 'picture')} in {folder}", {"pictures": pictures}
 
 
 PLAN = StageSpec(

@@ -14,6 +14,7 @@ from alice_survey.core.errors import WorkspaceError
 from alice_survey.core.manifest import read_manifest
 from alice_survey.core.products import listed_in
 from alice_survey.core.stages import StageSpec, Summary, only, without
+from alice_survey.kit.words import count, figure_rows, text_table
 
 CONTROL_FILES = ("control.csv", "picks.csv", "markers.csv")
 SCALE_FILE = "scale.json"
@@ -45,7 +46,7 @@ def _mapping_inputs(workspace: Path) -> list[Path]:
 
 def _mapping_summary(folder: Path) -> Summary:
     found = records.MappingRecord.read(folder / "mapping.json")
-    text = f"{found.registered} of {found.total} pictures in the model, in its own gauge"
+    text = f"{found.registered} of {count(found.total, 'picture')} in the model, in its own gauge"
     return text, {"registered": found.registered, "total": found.total}
 
 
@@ -83,7 +84,7 @@ def _picks_of_control(workspace: Path) -> dict[str, str]:
 def _placing_summary(folder: Path) -> Summary:
     found = records.RegistrationRecord.read(folder / "registration.json")
     text = (
-        f"{found.registered} of {found.total} pictures registered, "
+        f"{found.registered} of {count(found.total, 'picture')} registered, "
         f"{found.mean_reprojection_px:.2f} px; {found.scale_source}"
     )
     if found.joints:
@@ -107,7 +108,7 @@ def _model_inputs(workspace: Path) -> list[Path]:
 def _dense_summary(folder: Path) -> Summary:
     found = records.CloudRecord.read(folder / "cloud.json")
     surfaces = [folder / "dem.tif", *sorted(folder.glob("planes/*/dem.tif"))]
-    text = f"{found.points} points; surface in {', '.join(str(path) for path in surfaces)}"
+    text = f"{count(found.points, 'point')}; surface in {', '.join(str(path) for path in surfaces)}"
     return text, found.to_json()
 
 
@@ -137,7 +138,7 @@ def _mesh_inputs(workspace: Path) -> list[Path]:
 def _mesh_summary(folder: Path) -> Summary:
     found = records.MeshRecord.read(folder / "mesh.json")
     text = (
-        f"{found.triangles} triangles, {found.textured_share:.0%} textured, in "
+        f"{count(found.triangles, 'triangle')}, {found.textured_share:.0%} textured, in "
         f"{folder / 'mesh.glb'}"
     )
     return text, found.to_json()
@@ -162,12 +163,7 @@ def _evaluate_inputs(workspace: Path) -> list[Path]:
 
 def _evaluate_summary(folder: Path) -> Summary:
     score = records.ScoreRecord.read(folder / "score.json").to_json()
-    rows = [
-        (f"{group}.{name}", value)
-        for group, part in score.items()
-        for name, value in (part or {}).items()
-    ]
-    table = "\n".join(f"  {name:44} {value}" for name, value in rows)
+    table = text_table(("figure", "value"), list(figure_rows(score)))
     return f"score in {folder / 'score.json'}\n{table}", score
 
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from alice_survey.app.stages import spec
 from alice_survey.core.artefacts import StageRecord, read_json
 from alice_survey.core.config import CameraConfig, ImagingConfig, ReconstructConfig
 from alice_survey.core.contents import taken_from
@@ -240,8 +241,9 @@ def correction(
     ran = {
         name: record.cpu_s
         for name, record in records.items()
-        if name in costs and record.processor == here and record.cpu_s and not record.resumed
-    }
+        if name in costs and record.command == spec(name).command  # an import only copies
+        and record.processor == here and record.cpu_s and not record.resumed
+    }  # fmt: skip
     if not ran:
         return 1.0, 1.0, []
     ratio = sum(ran.values()) / sum(costs[name].cpu_s for name in ran)

@@ -24,11 +24,12 @@ from alice_survey.core.config import (
     parse_config,
     settings_in,
 )
-from alice_survey.core.errors import ConfigError, WorkspaceError, command_line, warn
+from alice_survey.core.errors import ConfigError, WorkspaceError, offer, warn
 from alice_survey.core.executor import Executor, local_executor
 from alice_survey.core.run import progress
 from alice_survey.core.settings_form import settings_template
 from alice_survey.core.stages import StageSpec, is_imported
+from alice_survey.kit.words import digits
 
 if TYPE_CHECKING:
     from alice_survey.core.settings_text import Values
@@ -197,7 +198,7 @@ def settings(workspace: Path, survey: Path | None, *, needed: bool) -> SurveyCon
             return load_config(path)
     if not needed:
         return SurveyConfig()
-    begin, real = command_line("init", workspace), stage_command("import-images", workspace)
+    begin, real = offer("init", workspace), stage_command("import-images", workspace)
     if (workspace / "images.partial").exists():
         raise ConfigError(f"an import into {workspace} has not finished: do it again, {real!r}")
     raise ConfigError(
@@ -249,15 +250,11 @@ def init_survey(
         text = with_settings_changed(text, values)
     config = parse_config(settings_in(text, "the new survey"), "the new survey")
     if area is not None:
-        from missions.areas.files import UnstatedError
         from missions.areas.survey import survey_area
 
-        try:
-            shapes = config.area.model_copy(update={"file": area})
-            say(f"area: {survey_area(shapes, turn_margin_m=3.0).place}")
-        except UnstatedError as fault:
-            begin = command_line("init", folder)
-            raise UnstatedError(f"{fault}; {begin!r} writes settings to set it in") from None
+        shapes = config.area.model_copy(update={"file": area})
+        found = survey_area(shapes, turn_margin_m=3.0)
+        say(f"area: {found.datum.place}, {digits(found.survey.area)} m2")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         path.write_text(text, encoding="utf-8")
@@ -306,7 +303,7 @@ def workspace_status(
 ) -> tuple[str, dict[str, Any]]:
     """State of a workspace, stage by stage, and the next command."""
     if not workspace.is_dir():
-        begin = command_line("init", workspace)
+        begin = offer("init", workspace)
         raise WorkspaceError(f"{workspace}: no such folder; {begin!r} makes one")
     imported = is_imported(workspace)
     config = settings(workspace, survey, needed=not imported)

@@ -27,14 +27,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic_core import to_jsonable_python
 
 from alice_survey.core.contents import MAX_TEXT, as_line, first_fault, ordinary_file
-from alice_survey.core.errors import (
-    AliceError,
-    NavigationError,
-    WorkspaceError,
-    command_line,
-    warn,
-    why,
-)
+from alice_survey.core.errors import AliceError, NavigationError, WorkspaceError, offer, warn, why
 from alice_survey.core.run import progress
 from alice_survey.core.run.resources import processor, versions, watch_meter
 
@@ -309,7 +302,7 @@ def need_stage(workspace: Path, name: str, command: str) -> Path:
 def stage_command(command: str, workspace: Path) -> str:
     """The command that makes a stage of a workspace, as a shell takes it."""
     given = {"import-images": ("PICTURES",), "join": ("DIVE", "DIVE")}.get(command, ())
-    return command_line(command, *given, "-w", workspace)
+    return offer(command, *given, "-w", workspace)
 
 
 def refuse_damage(folder: Path, record: StageRecord | None) -> None:
@@ -400,9 +393,8 @@ def _is_entry(path: Path, now: FileEntry, written: FileEntry) -> bool:
 
 
 def _damage_error(folder: Path, record: StageRecord, damaged: str) -> WorkspaceError:
-    again = "the command that wrote it"
-    if record.command:
-        again = repr(stage_command(record.command, folder.parent))
+    by = record.command
+    again = repr(stage_command(by, folder.parent)) if by else "the command that wrote it"
     return WorkspaceError(f"{folder}: {damaged}; run {again} again, which makes it")
 
 

@@ -19,7 +19,7 @@ from pydantic import (
 from pydantic.config import JsonDict
 
 from alice_survey.core.contents import as_line, one_line, ordinary_file, parse_toml
-from alice_survey.core.errors import ConfigError, command_line, why
+from alice_survey.core.errors import ConfigError, offer, why
 from alice_survey.core.seawater import GREEN_NM, n_water, n_water_sigma
 
 Jerlov = Literal["I", "II", "III", "1C", "3C", "5C", "7C", "9C"]
@@ -763,7 +763,7 @@ def load_config(path: str | Path) -> SurveyConfig:
     try:
         text = ordinary_file(path, 4 * _MAX_LENGTH).read_text(encoding="utf-8")
     except FileNotFoundError:
-        begin = command_line("init", path.parent)
+        begin = offer("init", path.parent)
         raise ConfigError(f"{path}: no such file; {begin!r} writes one") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read: {why(error)}") from None

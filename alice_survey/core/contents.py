@@ -191,18 +191,17 @@ def xml_root(text: str) -> ET.Element:
         raise ValueError(f"not valid XML: {error}") from None
 
 
-def xml_root_name(content: bytes) -> str:
-    """Name of the first element of XML in any encoding, without its namespace's prefix.
+def xml_names(content: bytes) -> list[str]:
+    """Names of the elements of XML in any encoding, in order, without prefixes of namespaces.
 
     Raises:
         ValueError: it declares a document type, or is not valid XML; the message names the line.
     """
     parser = expat.ParserCreate()
-    roots: list[str] = []
+    names: list[str] = []
 
     def start(name: str, _: dict[str, str]) -> None:
-        if not roots:
-            roots.append(name)
+        names.append(name.rpartition(":")[2])
 
     def refuse(*_: object) -> None:
         raise ValueError(
@@ -215,7 +214,7 @@ def xml_root_name(content: bytes) -> str:
         parser.Parse(content, True)
     except (expat.ExpatError, LookupError) as error:  # an encoding unknown to Python
         raise ValueError(f"not valid XML: {error}") from None
-    return roots[0].rpartition(":")[2]
+    return names
 
 
 @contextlib.contextmanager

@@ -169,8 +169,8 @@ def why(error: Exception) -> str:
     return str(error)
 
 
-def command_line(command: str, *words: object) -> str:
-    """A command of this program as a shell takes it: what holds spaces is quoted."""
+def offer(command: str, *words: object) -> str:
+    """A command of this program, to be offered as a shell takes it: spaces are quoted."""
     return shlex.join(["alice-survey", *command.split(), *map(str, words)])
 
 

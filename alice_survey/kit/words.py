@@ -1,10 +1,11 @@
 """Numbers as people read them: two or three digits, and a unit that fits."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 _SIGMA_DIGITS = 2
+_UNITS = ("mm", "m", "px", "deg", "ppm", "l")
 
 
 def length(metres: float | None, unit: str = "m") -> str:
@@ -87,6 +88,24 @@ def duration(seconds: float) -> str:
 def count(number: int, one: str, many: str = "") -> str:
     """`1 picture`, `1,876,280 points`."""
     return f"{number:,} {one if number == 1 else many or one + 's'}"
+
+
+def figure_rows(values: Mapping[str, Any], of: str = "") -> Iterator[tuple[str, str]]:
+    """Name and text of each figure of nested JSON values: `surface rms_mm` as `surface rms`, in mm.
+
+    Args:
+        values: by names that end with their unit, or groups of them.
+        of: the group that they are of.
+    """
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            yield from figure_rows(value, f"{of}{key} ".replace("_", " "))
+            continue
+        stem, _, unit = key.rpartition("_")
+        name, unit = (stem, f" {unit}") if unit in _UNITS else (key, "")
+        each = [v for v in (value if isinstance(value, list) else [value]) if v is not None]
+        texts = [digits(v) if isinstance(v, float) else f"{v:,}" for v in each]
+        yield f"{of}{name}".replace("_", " "), ", ".join(texts) + unit if texts else "unknown"
 
 
 def text_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

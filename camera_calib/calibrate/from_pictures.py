@@ -25,7 +25,7 @@ from alice_survey.core.artefacts import (
     sync_folder,
 )
 from alice_survey.core.config import CameraConfig, WaterConfig
-from alice_survey.core.errors import AliceError, CalibrationError, command_line
+from alice_survey.core.errors import AliceError, CalibrationError, offer
 from alice_survey.core.executor import Executor, local_executor
 from alice_survey.core.frames import Array
 from alice_survey.core.manifest import read_manifest
@@ -98,7 +98,7 @@ def _next(calibration: Calibration, task: CalibrationTask, output: Path) -> Iter
     yield mount_line(calibration.rig)
     if calibration.rig.body_from_rig is None:
         mounted = ("--mount", "nadir-bow-up", "--lever", 0.55, -0.05, 0.08, "--overwrite")
-        command = command_line("camera convert", rig, rig, *mounted)
+        command = offer("camera convert", rig, rig, *mounted)
         yield f"  state it with {command}, or let a survey with navigation find it"
     if not task.options.water:
         more = shlex.join(["--water", "--glass", "MM", "--start", str(rig)])

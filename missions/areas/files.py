@@ -5,9 +5,9 @@ its size, kind, names and entities. Heights are left out.
 """
 
 import contextlib
+import itertools
 import json
 import re
-import struct
 import tempfile
 import warnings
 import zipfile
@@ -15,7 +15,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
-from xml.parsers import expat
 
 import numpy as np
 import shapely
@@ -31,9 +30,10 @@ from alice_survey.core.contents import (
     one_line,
     opened_archive,
     parse_number,
-    xml_root_name,
+    xml_names,
 )
 from alice_survey.core.errors import PlanError, warn
+from alice_survey.kit.words import count
 from missions.areas.crs import LOCAL, geographic_shapes, parse_crs, usable_crs
 from missions.areas.raw import RawShapes, closed_as_polygons, from_geometries, from_rings
 from missions.logs.navigation_csv import USUAL_NAMES, bare_name
@@ -52,21 +52,16 @@ DRIVERS = {
 """GDAL's drivers by the ending of a file."""
 SUFFIXES = (*DRIVERS, ".csv", ".poly", ".wkt")
 _MISSIONS = (".waypoints", ".plan", ".mission")
-_DEGREES = ("latitude_deg", "longitude_deg")
-_CORNERS = {
-    "EPSG:4326": {name: USUAL_NAMES[name] for name in _DEGREES},
-    None: {"north": "northing northings y n", "east": "easting eastings x e"},
-}
-"""By coordinate system the columns of corners, y before x, and usual names of each."""
+_CORNERS: Sequence[tuple[str | None, *tuple[str, ...]]] = (
+    ("EPSG:4326", USUAL_NAMES["latitude_deg"], USUAL_NAMES["longitude_deg"]),
+    (None, "north northing northings y n", "east easting eastings x e"),
+)
+"""Coordinate systems, and the names of the columns of corners in them, y before x."""
 _PARTS = ("LinearRing", "LineString", "Point", "Track", "trkseg", "rte", "wpt")
-"""Elements of KML and GPX that are a ring, a line or a point."""
-
+_PLACES = ("coordinates", "coord", "trkpt", "rtept")
+"""Elements of KML and GPX that are a ring, a line or a point, and those with their places."""
 _GEOJSON_LEVELS = {"MultiPoint": 1, "MultiLineString": 1, "Polygon": 1, "MultiPolygon": 2}
 """How deep in its coordinates the rings, lines and points of a geometry are."""
-
-
-class UnstatedError(PlanError):
-    """A file does not say what a setting then has to: its coordinate system, or the layer."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -115,8 +110,7 @@ def read_area_file(
     else:
         chosen = _read_corners(path)
     found = _in_wgs84(path, chosen, crs, role)
-    # GPX has no polygons; what an area to survey means by it, a setting says.
-    return closed_as_polygons(found) if suffix == ".gpx" and role != "survey" else found
+    return closed_as_polygons(found) if suffix == ".gpx" else found  # it has no polygons
 
 
 def _read_text(path: Path) -> str:
@@ -132,16 +126,20 @@ def _read_corners(path: Path) -> _Layer:
     Raises:
         PlanError: a row holds no corner; the message names its line.
     """
-    header, rows = list(_DEGREES), _poly_rows(path)
     if path.suffix.lower() == ".csv":
         header, rows = stream_csv(path, fault=PlanError)
+    else:
+        lines = enumerate(_read_text(path).splitlines(), 1)
+        cells = [(n, text.split()) for n, text in lines if text.strip() and text[0] != "#"]
+        header = ["lat", "lon"]
+        rows = ((n, dict(zip(header, row, strict=False))) for n, row in cells)
     bare = {bare_name(one): one for one in reversed(header)}
-    found: dict[str | None, list[str]] = {}
-    for crs, columns in _CORNERS.items():
-        names = [(bare_name(own), *usual.split()) for own, usual in columns.items()]
-        found[crs] = [bare[one] for some in names for one in [n for n in some if n in bare][:1]]
-    crs, used = next((pair for pair in found.items() if len(pair[1]) == 2), (None, []))
-    if not used:
+    known = [
+        (crs, [bare[name] for one in axes for name in [n for n in one.split() if n in bare][:1]])
+        for crs, *axes in _CORNERS
+    ]
+    crs, used = max(known, key=lambda pair: len(pair[1]))
+    if len(used) != 2:
         raise PlanError(
             f"area: {path}: no columns latitude_deg and longitude_deg, or north and east; it has "
             f"{as_line(', '.join(header))}"
@@ -152,7 +150,7 @@ def _read_corners(path: Path) -> _Layer:
     ring = []
     for line, row in rows:
         try:
-            corner = [parse_number(row[name]) for name in used]
+            corner = [parse_number(row.get(name, "")) for name in used]
         except ValueError as error:
             raise PlanError(f"area: {path} line {line}: {error}") from None
         if any(map(is_unknown, corner)) or (crs is not None and is_nowhere(*corner)):
@@ -160,15 +158,6 @@ def _read_corners(path: Path) -> _Layer:
         ring.append(corner)
     _refuse_corners(path.name, len(ring))
     return _Layer(name="", shapes=from_rings(path.name, [ring], geographic=False), crs=crs)
-
-
-def _poly_rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
-    for line, text in enumerate(_read_text(path).splitlines(), 1):
-        cells = text.split()
-        if cells and not text.startswith("#"):
-            if len(cells) != 2:
-                raise PlanError(f"area: {path} line {line}: not a latitude and a longitude")
-            yield line, dict(zip(_DEGREES, cells, strict=True))
 
 
 def read_wkt(origin: str, text: str, crs: str | None) -> RawShapes:
@@ -300,7 +289,7 @@ def _gdal_layers(file: Path, shown: Path, driver: str) -> list[_Layer]:
 
 
 def refuse_lost_parts(file: Path, shown: Path, read: Sequence[RawShapes]) -> None:
-    """Refuse a file of which GDAL has left out rings, lines or points.
+    """Refuse a file of whose rings, lines and points GDAL has left out some, as it does in text.
 
     Args:
         file: as `gis_files` has it.
@@ -310,73 +299,38 @@ def refuse_lost_parts(file: Path, shown: Path, read: Sequence[RawShapes]) -> Non
     Raises:
         PlanError: with both numbers.
     """
-    kind, known = DRIVERS[file.suffix], sum(one.parts for one in read)
-    if kind == "GeoJSON":
-        count = _parts_of_geojson(read_geojson(file))
-    elif kind == "ESRI Shapefile":
-        count = _parts_of_shapefile(file.read_bytes())
-    else:
-        count = known if kind == "GPKG" else _parts_of_xml(file.read_bytes())
-    if count != known:
+    known = sum(one.parts for one in read)
+    kinds = {"KML": _parts_of_xml, "GPX": _parts_of_xml, "GeoJSON": _parts_of_geojson}
+    kind = DRIVERS[file.suffix]
+    held = kinds[kind](file) if kind in kinds else known
+    if held != known:
         raise PlanError(
-            f"area: {shown}: it holds {count} rings, lines and points, of which {known} can be "
+            f"area: {shown}: it holds {held} rings, lines and points, of which {known} can be "
             "read: write it again with a GIS"
         )
 
 
-def _parts_of_xml(content: bytes) -> int:
-    """How many elements of `_PARTS` with coordinates there are in KML or GPX."""
-    opened: list[list[Any]] = [["", False], ["", False]]
-    count = 0
-
-    def start(name: str, _: dict[str, str]) -> None:
-        name = name.rpartition(":")[2]
-        opened[-1][1] |= name in ("trkpt", "rtept")
-        opened.append([name, name == "wpt"])
-
-    def text(data: str) -> None:
-        opened[-2][1] |= opened[-1][0] in ("coordinates", "coord") and bool(data.strip())
-
-    def end(_: str) -> None:
-        nonlocal count
-        name, is_filled = opened.pop()
-        count += is_filled and name in _PARTS
-
-    parser = expat.ParserCreate()
-    parser.StartElementHandler, parser.EndElementHandler = start, end
-    parser.CharacterDataHandler = text
-    parser.Parse(content, True)  # `gis_files` has looked whether it is valid
-    return count
+def _parts_of_xml(file: Path) -> int:
+    names = [name for name in xml_names(file.read_bytes()) if name in (*_PARTS, *_PLACES)]
+    pairs = itertools.pairwise([*names, ""])
+    return sum(a == "wpt" or (a in _PARTS and b in _PLACES) for a, b in pairs)
 
 
-def _parts_of_geojson(data: Any) -> int:
-    waiting, count = [data], 0
+def _parts_of_geojson(file: Path) -> int:
+    waiting: list[Any] = [read_geojson(file)]
+    found = 0
     while waiting:
         one = waiting.pop()
+        if isinstance(one, list):
+            waiting += one
         if not isinstance(one, dict):  # a feature without a place
             continue
-        for key in ("features", "geometries"):
-            waiting += one[key] if isinstance(one.get(key), list) else []
-        waiting.append(one.get("geometry"))
+        waiting += [one.get(key) for key in ("features", "geometry", "geometries")]
         parts = [one.get("coordinates", [])]
         for _ in range(_GEOJSON_LEVELS.get(str(one.get("type")), 0)):
             parts = [part for some in parts for part in (some if isinstance(some, list) else [0])]
-        count += sum(part != [] for part in parts)
-    return count
-
-
-def _parts_of_shapefile(content: bytes) -> int:
-    """By the records of a `.shp` (ESRI, "Shapefile Technical Description", 1998)."""
-    at, count = 100, 0
-    while at + 12 <= len(content):
-        (words,) = struct.unpack_from(">i", content, at + 4)
-        (kind,) = struct.unpack_from("<i", content, at + 8)
-        if kind in (1, 11, 21):
-            count += 1
-        elif kind and at + 48 <= len(content):
-            count += struct.unpack_from("<i", content, at + 44)[0]
-        at += 8 + 2 * max(words, 2)
-    return count
+        found += sum(part != [] for part in parts)
+    return found
 
 
 def _shapes(wkb: Sequence[bytes | None], file: str, *, several: bool, layer: str) -> RawShapes:
@@ -395,10 +349,10 @@ def _shapes(wkb: Sequence[bytes | None], file: str, *, several: bool, layer: str
     return shapes
 
 
-def _refuse_corners(origin: str, count: int) -> None:
-    if count > MAX_CORNERS:
+def _refuse_corners(origin: str, number: int) -> None:
+    if number > MAX_CORNERS:
         raise PlanError(
-            f"area: {origin}: {count} corners; at most {MAX_CORNERS}: simplify it, or cut "
+            f"area: {origin}: {number} corners; at most {MAX_CORNERS}: simplify it, or cut "
             "out the part to survey"
         )
 
@@ -424,7 +378,7 @@ def _choose(path: Path, layers: list[_Layer], layer: str | None, role: Role) -> 
     ]
     if not usable:
         points = sum(len(one.shapes.points) for one in layers)
-        held = f"{points} point{'s' if points > 1 else ''} only" if points else "no shapes"
+        held = f"{count(points, 'point')} only" if points else "no shapes"
         raise PlanError(f"area: {path}: it holds {held}; an area needs a polygon or a line")
     others = [one.name for one in layers if one not in usable and not one.shapes.is_empty]
     if others:
@@ -432,7 +386,7 @@ def _choose(path: Path, layers: list[_Layer], layer: str | None, role: Role) -> 
     if len(usable) > 1:
         names = ", ".join(repr(one.name) for one in usable)
         cure = "set layer to one of them" if role == "survey" else "save one as a file of its own"
-        raise UnstatedError(f"area: {path}: shapes in the layers {names}: {cure}")
+        raise PlanError(f"area: {path}: shapes in the layers {names}: {cure}")
     return usable[0]
 
 
@@ -451,7 +405,7 @@ def _in_wgs84(path: Path, layer: _Layer, crs: str | None, role: Role) -> RawShap
         return layer.shapes
     if own is None or (crs is not None and not _is_map(own)):
         if crs is None:
-            raise UnstatedError(
+            raise PlanError(
                 f"area: {path}: it does not say its coordinate system: set crs, such as "
                 f"EPSG:32636, or {LOCAL!r} for metres east and north of the datum"
             )
@@ -551,7 +505,7 @@ def gis_files(path: Path) -> Iterator[list[Path]]:
             kind = DRIVERS[suffix]
             if kind in ("KML", "GPX"):
                 content = read_bytes(files[0])
-                root = xml_root_name(content)
+                root = xml_names(content)[0]
                 if root != kind.lower():
                     raise ValueError(f"not {kind}: its first element is {root!r}")
                 files[0].unlink()

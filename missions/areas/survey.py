@@ -12,6 +12,7 @@ from shapely.geometry.base import BaseGeometry
 from alice_survey.core.config import AreaConfig
 from alice_survey.core.errors import PlanError, warn
 from alice_survey.core.frames import Array, Datum
+from alice_survey.kit.words import count
 from missions.areas.crs import LocalFrame, middle
 from missions.areas.files import Role, read_area_file, read_wkt
 from missions.areas.raw import RawShapes, closed_as_polygons, from_rings, is_closed, no_points
@@ -232,8 +233,7 @@ def _less(shape: MultiPolygon, taken: MultiPolygon) -> MultiPolygon:
 
 def _contents(raw: RawShapes) -> str:
     counts = {"polygon": len(raw.polygons), "line": len(raw.lines), "point": len(raw.points)}
-    parts = [f"{n} {what}{'s' if n > 1 else ''}" for what, n in counts.items() if n]
-    return " and ".join(parts) or "nothing"
+    return " and ".join(count(n, what) for what, n in counts.items() if n) or "nothing"
 
 
 def _check_inside(area: Area, raw: RawShapes, frame: LocalFrame, given: str) -> None:
@@ -302,16 +302,9 @@ def _with_closed_lines(raw: RawShapes, settings: AreaConfig) -> RawShapes:
     drawn = settings.file is not None or settings.wkt is not None
     if not (ours and drawn) or settings.closed_lines == "corridor":
         return raw
-    what = "a line that closes is" if len(ours) == 1 else f"{len(ours)} lines that close are"
-    is_gpx = settings.file is not None and settings.file.suffix.lower() == ".gpx"
-    if settings.closed_lines is None and is_gpx:
-        warn(
-            f"area: {raw.origin}: {what} the edge of the area, since GPX has no polygons: set "
-            "area.closed_lines = 'corridor' if the line itself is meant, or 'inside'"
-        )
-        return closed_as_polygons(raw)
     if settings.closed_lines == "inside":
         return closed_as_polygons(raw)
+    what = "a line that closes is" if len(ours) == 1 else f"{len(ours)} lines that close are"
     warn(
         f"area: {raw.origin}: {what} surveyed as a corridor of {settings.corridor_width_m:g} m "
         "along the line, not what lies inside: set area.closed_lines = 'inside' for that, or "
@@ -450,8 +443,8 @@ def _ring_area(ring: Array, name: str, report: _Reporter) -> Polygon | MultiPoly
             [Polygon(p.exterior, [r for r in p.interiors if Polygon(r).area > 1e-6]) for p in parts]
         )
     )
-    count = f"{len(parts)} part{'s' if len(parts) > 1 else ''}"
-    warn(report.text(name, f"taken as {count} of {kept.area:.4g} m2: its edge meets itself", where))
+    some = count(len(parts), "part")
+    warn(report.text(name, f"taken as {some} of {kept.area:.4g} m2: its edge meets itself", where))
     return kept.geoms[0] if len(kept.geoms) == 1 else kept
 
 

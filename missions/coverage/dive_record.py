@@ -251,7 +251,7 @@ def _record_of(
     left_out: dict[str, int] = {}
     beyond = (triggers.time_s < nav.time_s[0]) | (triggers.time_s > nav.time_s[-1])
     lost = ~np.isfinite(at["latitude_deg"] + at["longitude_deg"])
-    _count(left_out, f"beyond the log ({nav.time_s[0]:.1f} to {nav.time_s[-1]:.1f} s)", beyond)
+    _count(left_out, f"beyond the log ({nav.span(nav.time_s)})", beyond)
     _count(left_out, f"in a gap of the log over {nav.max_gap_s:.1f} s", lost & ~beyond)
     nothing = np.full(len(lost), np.nan)
     at = {"depth_m": nothing, "altitude_m": nothing} | at
@@ -266,8 +266,7 @@ def _record_of(
     if not len(kept):
         raise NavigationError(
             f"{path}: the log has no position at any of {len(triggers.time_s)} triggers "
-            f"({triggers.time_s[0]:.1f} to {triggers.time_s[-1]:.1f} s; the log is of "
-            f"{nav.time_s[0]:.1f} to {nav.time_s[-1]:.1f} s): check the clocks"
+            f"({nav.span(triggers.time_s)}; the log is of {nav.span(nav.time_s)}): check the clocks"
         )
     at = {name: values[kept] for name, values in at.items()}
     time_s = triggers.time_s[kept]

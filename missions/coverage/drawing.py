@@ -27,7 +27,7 @@ from alice_survey.kit.figure import (
     new_figure,
     save_figure,
 )
-from alice_survey.kit.words import share
+from alice_survey.kit.words import count, share
 from missions.coverage.certificate import Certificate
 from missions.coverage.holes import Hole, geodetic
 from missions.coverage.raster import north_up
@@ -180,14 +180,13 @@ def _class(low: int, following: int) -> str:
 def _figures(certificate: Certificate, holes: Sequence[Hole]) -> str:
     pattern = certificate.pattern
     asked = pattern.passes * pattern.pictures
-    holes_text = f"{len(holes)} hole" if len(holes) == 1 else f"{len(holes)} holes"
     return (
-        f"{certificate.stations} stations, {certificate.taken} pictures; seen "
+        f"{count(certificate.stations, 'station')}, {count(certificate.taken, 'picture')}; seen "
         f"{share(certificate.covered_share, 2)}, in stereo "
         f"{share(certificate.stereo_share, 2)}, at the "
         f"requested overlap {share(certificate.share_at_overlap, 2)}\n(that is "
-        f"{pattern.passes} line{'s' if pattern.passes > 1 else ''} and {asked} pictures of each "
-        f"camera); {holes_text}, {sum(hole.area_m2 for hole in holes):.2f} m²; "
+        f"{count(pattern.passes, 'line')} and {count(asked, 'picture')} of each "
+        f"camera); {count(len(holes), 'hole')}, {sum(hole.area_m2 for hole in holes):.2f} m²; "
         f"grid {100 * certificate.grid.cell_m:.1f} cm"
     )
 

@@ -16,6 +16,7 @@ from alice_survey.core.artefacts import read_csv
 from alice_survey.core.contents import is_unknown, parse_number
 from alice_survey.core.errors import NavigationError, warn
 from alice_survey.core.frames import Array, Datum
+from alice_survey.kit.words import count
 from missions.logs.autopilot_logs import (
     MAGIC,
     first_bytes,
@@ -377,7 +378,7 @@ def _report(
         )
     if not dive.dated:
         notes.append("the log has no dates: pictures are tied to it by --clock-offset alone")
-    head = f"{path}: {dive.kind}, {dive.clock}\n{out}: {len(time_s)} rows from "
+    head = f"{path}: {dive.kind}, {dive.clock}\n{out}: {count(len(time_s), 'row')} from "
     head += f"{_moment(float(time_s[0]))}, {data['duration_s']:.1f} s"
     return "\n  ".join([head, *notes]), data
 

@@ -1,5 +1,6 @@
 """A navigation log of a real dive, and what it gives at the time of each picture."""
 
+import contextlib
 import difflib
 import itertools
 import math
@@ -17,6 +18,7 @@ from alice_survey.core.artefacts import stream_csv
 from alice_survey.core.contents import as_line, is_nowhere, is_unknown, parse_number
 from alice_survey.core.errors import NavigationError, warn
 from alice_survey.core.frames import SYSTEM, Array, degrees_from
+from alice_survey.kit.words import count
 from missions.values.navigation import COLUMNS
 
 POSITION, READINGS = COLUMNS[:3], COLUMNS[:7]
@@ -75,6 +77,18 @@ class NavigationLog:
     def max_gap_s(self) -> float:
         """Seconds between rows beyond which nothing is interpolated."""
         return max_gap_s(self.time_s)
+
+    def span(self, time_s: Array) -> str:
+        """First and last of some times: dates where the log has dates, else seconds of its clock.
+
+        NaN are not counted.
+        """
+        ends = float(np.nanmin(time_s)), float(np.nanmax(time_s))
+        with contextlib.suppress(OverflowError):  # beyond the years 1 to 9999
+            if self.start_utc is not None:
+                dates = [self.start_utc + timedelta(seconds=end) for end in ends]
+                return f"{' to '.join(f'{date:%Y-%m-%d %H:%M:%S}' for date in dates)} UTC"
+        return f"{ends[0]:.1f} to {ends[1]:.1f} s"
 
     def at(self, time_s: Array) -> dict[str, Array]:
         """All columns at other times, (N,) each.
@@ -413,10 +427,9 @@ def warn_of_gaps(images: Sequence[str], time_s: Array, found: Array, log: Naviga
         return
     names = ", ".join(images[i] for i in lost[:_NAMED])
     more = f" and {len(lost) - _NAMED} more" if len(lost) > _NAMED else ""
-    known = [time_s[i] for i in lost if np.isfinite(time_s[i])]
-    when = f"; their times are {min(known):.1f} to {max(known):.1f} s" if known else ""
+    known = time_s[lost][np.isfinite(time_s[lost])]
+    when = f"; their times are {log.span(known)}" if len(known) else ""
     warn(
-        f"{len(lost)} pictures get no navigation, without a time, beyond the log "
-        f"({log.time_s[0]:.1f} to {log.time_s[-1]:.1f} s) or in a gap over "
-        f"{log.max_gap_s:.1f} s{when}: {names}{more}"
+        f"{count(len(lost), 'picture')} without navigation, without a time, beyond the log "
+        f"({log.span(log.time_s)}) or in a gap over {log.max_gap_s:.1f} s{when}: {names}{more}"
     )

@@ -16,7 +16,7 @@ from alice_survey.kit.figure import (
     figure_style,
     save_figure,
 )
-from alice_survey.kit.words import share
+from alice_survey.kit.words import count, share
 from camera_calib.rig import Rig, design_rig
 from missions.areas.bathymetry import Bathymetry
 from missions.coverage.certificate import Certificate, certificate
@@ -120,9 +120,9 @@ def _summary(plan: Plan, sea: SeaConfig) -> str:
     current = ""
     if sea.current_mps > 0 and sea.current_file is None:
         current = f", current {sea.current_mps:g} m/s towards {sea.current_towards_deg:03.0f} deg"
-    dives = f"{len(plan.dives)} dives, " if len(plan.dives) > 1 else ""
+    stations, dives = count(plan.stations, "station"), count(len(plan.dives), "dive")
     return (
-        f"{plan.stations} stations every {plan.interval_s:.2f} s, {plan.length_m:.0f} m, {dives}"
+        f"{stations} every {plan.interval_s:.2f} s, {plan.length_m:.0f} m, {dives}, "
         f"{plan.duration_s / 60:.0f} min at {plan.speed_mps:g} m/s, {plan.energy_wh:.0f} Wh\n"
         f"altitude {plan.altitude_m:g} m, overlap {plan.reached_forward_overlap:.0%} forward, "
         f"{plan.reached_side_overlap:.0%} side, lines {plan.line_spacing_m:.2f} m apart, "

@@ -13,7 +13,6 @@ from shapely.geometry import MultiPolygon, mapping, shape
 
 from alice_survey.core.errors import PlanError
 from alice_survey.core.frames import Array, Datum
-from alice_survey.kit.words import digits
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,11 +33,6 @@ class Area:
             raise PlanError("area: nothing is left to survey")
         if self.allowed.is_empty:
             raise PlanError("area: there is no water the vehicle may be in: shrink the no-go zones")
-
-    @property
-    def place(self) -> str:
-        """Where it is on Earth, and how large: `32.82 N 34.96 E, 255 m2`."""
-        return f"{self.datum.place}, {digits(self.survey.area)} m2"
 
     @property
     def corners_ne(self) -> Array:

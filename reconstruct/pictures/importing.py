@@ -32,6 +32,7 @@ from alice_survey.core.errors import (
 from alice_survey.core.executor import SERIAL, Executor
 from alice_survey.core.manifest import ImageRecord, read_manifest, write_manifest
 from alice_survey.core.records import PicturesRecord
+from alice_survey.kit import words
 from camera_calib.freedom import part_of_rig
 from camera_calib.rig import Rig, read_rig, write_rig
 from missions.logs.navigation_csv import NavigationLog, find_zone, read_navigation
@@ -136,7 +137,7 @@ class ImportRecord(artefacts.JsonRecord):
         *others, last = self.cameras
         of = f" of {', '.join(others)} and {last}" if others else ""
         kinds = ", ".join(f"{count} {what}" for what, count in self.kinds.items())
-        text = f"{total} pictures ({kinds}){of}, {self.positions} with a position"
+        text = f"{words.count(total, 'picture')} ({kinds}){of}, {self.positions} with a position"
         for name, count in self.readings.items():
             text += f", {count} with {name}" if count > self.positions else ""
         return "\n".join([text, *self.lines])
@@ -356,17 +357,14 @@ def preview_import(
     text = ""
     if log is not None:
         known = [name for name, values in log.columns.items() if np.isfinite(values).any()]
-        text = f"{len(log.time_s)} rows with {', '.join(known)}"
+        text = f"{words.count(len(log.time_s), 'row')} with {', '.join(known)}"
         if log.row_of:
             text += ", by names of pictures"
         elif log.start_utc is not None:
             last = log.start_utc + timedelta(seconds=float(log.time_s[-1]))
             offset = timedelta(seconds=clock_offset_s)
             inside = sum(log.start_utc <= time + offset <= last for time in times)
-            text += (
-                f", {log.start_utc:%Y-%m-%d %H:%M:%S} to {last:%H:%M:%S} UTC; {inside} of "
-                f"{len(times)} picture times fall into it"
-            )
+            text += f", {log.span(log.time_s)}; {inside} of {len(times)} picture times fall into it"
     record = scan.record(
         rows, Counter(files.kind_of(path) for path in pictures), Counter(),
         {_NO_HEADER: [one.path.name for one in facts if one.fault],

@@ -26,6 +26,7 @@ from alice_survey.core.executor import Executor, progress
 from alice_survey.core.frames import Array, distances_m
 from alice_survey.core.manifest import ImageRecord
 from alice_survey.core.records import PlaceRecord
+from alice_survey.kit.words import count
 from camera_calib.calibrate.picture_sets import pair_pictures
 from camera_calib.picture_files import time_taken
 from camera_calib.rig import Rig
@@ -268,8 +269,7 @@ def _trigger_times(
     if not found:
         raise ImageError(f"{triggers}: holds none of the pictures, such as {lost[0]}")
     if lost:
-        names = files.list_names(lost)
-        warn(f"{len(lost)} pictures are not in {triggers} and are left out: {names}")
+        warn(f"not in {triggers}, and left out: {count(len(lost), 'picture')}: {files.list_names(lost)}")
     return found
 
 
@@ -339,8 +339,8 @@ def take_bag(
                 written[key] = folder / files.safe_name(camera) / f"{stem}{suffix}"
                 written[key].parent.mkdir(parents=True, exist_ok=True)
                 written[key].write_bytes(data)
-    for reason, count in sorted(lost.items()):
-        warn(f"{bag}: {count} {reason}")
+    for reason, number in sorted(lost.items()):
+        warn(f"{bag}: {number} {reason}")
     if not written:
         raise ImageError(f"{bag}: no picture could be taken")
     stations = [{c: written[key] for c, key in m.items() if key in written} for m in moments]
@@ -752,9 +752,9 @@ def place_records(
             )
         if log is not None:
             raise ImageError(
-                f"no picture was taken while navigation was logged: pictures at "
-                f"{np.nanmin(times):.1f} to {np.nanmax(times):.1f} s, log at {log.time_s[0]:.1f} "
-                f"to {log.time_s[-1]:.1f} s; check --clock-offset and --time-zone"
+                f"no picture was taken while navigation was logged: pictures from "
+                f"{log.span(times)}, log from {log.span(log.time_s)}; check --clock-offset and "
+                "--time-zone"
             )
         notes.append("no positions: no CRS, and unscaled unless a rig or a known length scales it")
         return records, None, "none"
@@ -854,5 +854,5 @@ def _with_gps(records: Sequence[ImageRecord], entries: Sequence[Incoming]) -> li
             )  # fmt: skip
         placed.append(record)
     if 0 < len(lost) < len(records):
-        warn(f"{len(lost)} pictures have no complete GPS in EXIF: {files.list_names(lost)}")
+        warn(f"no complete GPS in EXIF: {count(len(lost), 'picture')}: {files.list_names(lost)}")
     return placed

@@ -21,6 +21,7 @@ from alice_survey.core.block_solver import MAD_TO_SIGMA
 from alice_survey.core.errors import ImageError, why
 from alice_survey.core.executor import Executor
 from alice_survey.core.manifest import ImageRecord, read_manifest
+from alice_survey.kit.words import count
 from reconstruct.pictures.files import decode
 from reconstruct.pictures.normalise import even_light
 from reconstruct.pictures.undistorted import read_mask
@@ -296,8 +297,8 @@ def quality_report(workspace: Path, executor: Executor) -> tuple[str, dict[str, 
     flagged = [quality for quality in found if quality.flagged]
     lines = [f"{q.image}: {'; '.join(q.reasons)}" for q in flagged]
     lines.append(
-        f"{len(found)} pictures, {len(flagged)} to look at (all are still used where they can be); "
-        f"{folder / 'quality.csv'}"
+        f"{count(len(found), 'picture')}, {len(flagged)} to look at (all are still used where they "
+        f"can be); {folder / 'quality.csv'}"
     )
     medians = {}
     for name in _NUMBERS:

@@ -35,6 +35,7 @@ from alice_survey.core.executor import SERIAL, Executor
 from alice_survey.core.frames import SYSTEM, Array, distances_m
 from alice_survey.core.manifest import ImageRecord, read_manifest
 from alice_survey.core.records import MappingRecord, RegistrationRecord, ScaleRecord
+from alice_survey.kit.words import count
 from reconstruct.pictures.files import list_names, read_header, safe_name
 from reconstruct.pictures.undistorted import read_colour
 from reconstruct.placing.control_points import (
@@ -475,9 +476,10 @@ def import_control(
     write_picks(targets[1], picks)
     checks = [one.use for one in every].count("check")
     held = f" ({checks} of them to check by)" if checks else ""
-    bars = f", {len(lengths)} scale bar{'s' * (len(lengths) > 1)}" if lengths else ""
-    pictures = len({pick.image for pick in picks})
-    return f"{len(points)} points{bars}{held}, {len(picks)} picks in {pictures} pictures"
+    bars = f", {count(len(lengths), 'scale bar')}" if lengths else ""
+    pictures = count(len({pick.image for pick in picks}), "picture")
+    marks = count(len(picks), "pick")
+    return f"{count(len(points), 'point')}{bars}{held}, {marks} in {pictures}"
 
 
 _FAR_M, _FAR_SHARE = 100.0, 3.0

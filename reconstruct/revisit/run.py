@@ -13,7 +13,7 @@ import shapely
 from alice_survey.core.artefacts import refuse_links, write_json
 from alice_survey.core.block_solver import Flags
 from alice_survey.core.config import SurveyConfig
-from alice_survey.core.errors import PlanError, command_line, warn
+from alice_survey.core.errors import PlanError, offer, warn
 from alice_survey.core.executor import Executor
 from alice_survey.core.frames import Array
 from alice_survey.kit.figure import figure_style, save_figure
@@ -294,7 +294,7 @@ def _dive_text(
     return (
         f"\nthe dive over them: {words}; {dive['joining_stations']} of its stations are predicted "
         f"to join the model, {cured / whole:.0%} of the weakness to be cured: {dive['folder']}\n"
-        f"with its pictures: {command_line('join', workspace, dive['folder'], '-w', 'BOTH')}"
+        f"with its pictures: {offer('join', workspace, dive['folder'], '-w', 'BOTH')}"
     )
 
 

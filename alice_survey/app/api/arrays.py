@@ -13,6 +13,7 @@ from scipy.spatial.transform import RigidTransform
 
 from alice_survey.core.contents import taken_from
 from alice_survey.core.frames import Array
+from alice_survey.kit.words import count
 from reconstruct.placing.track import read_track_poses
 from reconstruct.raster import opened_raster
 from reconstruct.views.model import WorldFrame, read_frame
@@ -212,7 +213,7 @@ class Track(_Shown):
         return sigma
 
     def __repr__(self) -> str:
-        text = f"track: {len(self.images)} pictures in the frame '{self.frame.name}'"
+        text = f"track: {count(len(self.images), 'picture')} in the frame '{self.frame.name}'"
         if self.sigma is not None:
             text += f", median position sigma {np.median(self.sigma):.3g} {self.frame.unit}"
         return text

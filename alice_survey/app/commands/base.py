@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 import typer
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, field_validator
 
-from alice_survey.core.errors import ConfigError, note, pip_install
+from alice_survey.core.errors import ConfigError, note, offer, pip_install
 
 if TYPE_CHECKING:
     from alice_survey.core.executor import Executor
@@ -149,6 +149,11 @@ class WorkspaceCommand(CommandModel):
         if workspace.exists() and not workspace.is_dir():
             raise ValueError(f"{workspace} is a file, not the folder of a survey")
         return workspace
+
+    def show_next(self, found: object, folder: Path) -> None:
+        """Show what was brought into a folder, and the command that goes on."""
+        after = offer("reconstruct", "-w", self.workspace)
+        typer.echo(f"{found}\nin {folder}; next: {after}")
 
 
 class SurveyCommand(WorkspaceCommand, ReportCommand):

@@ -15,7 +15,7 @@ from alice_survey.app.commands.base import (
     argument,
     option,
 )
-from alice_survey.core.errors import ConfigError, command_line
+from alice_survey.core.errors import ConfigError
 
 
 class ImportImagesCommand(WorkspaceCommand, ThreadsCommand):
@@ -109,10 +109,7 @@ class ImportImagesCommand(WorkspaceCommand, ThreadsCommand):
                 triggers=self.triggers, split=self.split is not None, overwrite=self.replace,
                 executor=self.executor(),
             )  # fmt: skip
-        typer.echo(
-            f"{found}\nin {self.workspace / 'images'}; next: "
-            f"{command_line('reconstruct', '-w', self.workspace)}"
-        )
+        self.show_next(found, self.workspace / "images")
 
 
 class JoinCommand(WorkspaceCommand):
@@ -130,10 +127,7 @@ class JoinCommand(WorkspaceCommand):
         from reconstruct.pictures.importing import join_dives
 
         found = join_dives(self.workspace, self.dives)
-        typer.echo(
-            f"{found}\nin {self.workspace / 'images'}; next: "
-            f"{command_line('reconstruct', '-w', self.workspace)}"
-        )
+        self.show_next(found, self.workspace / "images")
 
 
 class ImportControlCommand(WorkspaceCommand):
@@ -164,10 +158,7 @@ class ImportControlCommand(WorkspaceCommand):
             self.workspace, self.file, sigma_m=self.sigma, sigma_vertical_m=self.sigma_vertical,
             heights=self.heights, overwrite=self.overwrite,
         )  # fmt: skip
-        typer.echo(
-            f"{found}\nin {self.workspace}; next: "
-            f"{command_line('reconstruct', '-w', self.workspace)}"
-        )
+        self.show_next(found, self.workspace)
 
 
 class ImportLogCommand(ReportCommand):

@@ -18,7 +18,7 @@ from alice_survey.app.commands.base import (
     argument,
     option,
 )
-from alice_survey.core.errors import command_line
+from alice_survey.core.errors import PlanError, offer
 
 
 class InitCommand(WorkspaceCommand):
@@ -33,9 +33,7 @@ class InitCommand(WorkspaceCommand):
         "init harbour --example caesarea",
     )
     area: Path | None = option(
-        None,
-        "GeoJSON, KML, GPX, GeoPackage, shapefile, WKT or corners of the area.",
-        metavar="FILE",
+        None, "GeoJSON, KML, GPX, GeoPackage, shapefile, WKT or CSV of the area.", metavar="FILE"
     )
     example: Literal["demo", "caesarea"] | None = option(None, "A ready survey instead.")
 
@@ -44,8 +42,13 @@ class InitCommand(WorkspaceCommand):
         from alice_survey.app.pipeline import init_survey
 
         template = f"{self.example or 'survey'}.toml"
-        path = init_survey(self.workspace, template, self.area, say=typer.echo)
-        typer.echo(f"wrote {path}; next: {command_line('plan', '-w', self.workspace)}")
+        try:
+            path = init_survey(self.workspace, template, self.area, say=typer.echo)
+        except PlanError as fault:
+            raise PlanError(
+                f"{fault}; {offer('init', self.workspace)!r} begins without it"
+            ) from None
+        typer.echo(f"wrote {path}; next: {offer('plan', '-w', self.workspace)}")
 
 
 class FovCommand(ReportCommand):

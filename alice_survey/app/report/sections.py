@@ -168,7 +168,7 @@ def _comparison(held: Held) -> Section:
 
 def _control(score: ControlRecord) -> Section:
     rows = [
-        (row.name, row.use, f"{row.views} pictures",
+        (row.name, row.use, count(row.views, "picture"),
          ", ".join(map(length, (row.north_m, row.east_m, row.down_m))),
          digits(row.misfit_sigmas, 2))
         for row in score.points

@@ -165,8 +165,6 @@ class _PlanTab:
         """The shapes of a file that was dropped on the page."""
         asked = call.ask(_AreaFile)
         name = Path(asked.name).name
-        if Path(name).suffix.lower() not in SUFFIXES:
-            raise PlanError(f"{name[:60]!r} is not read; those that are: {', '.join(SUFFIXES)}")
         found = self.settings()
         config = parse_settings(found.text, self.path)
         with tempfile.TemporaryDirectory() as scratch, keep_warnings() as warnings, _quiet():

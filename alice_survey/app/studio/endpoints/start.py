@@ -221,15 +221,14 @@ class _StartPage:
         except ValueError:
             raise AliceError(f"{given.name} did not arrive whole: choose it again") from None
         folder = self.studio.workspace.folder
-        area, toml = folder / f"area{suffix}", folder / "survey.toml"
-        refuse_links(folder, area, toml)
+        area = folder / f"area{suffix}"
+        refuse_links(folder, area)
         if area.exists():
             raise StaleError(f"{area} exists already: remove it first")
         try:
             area.write_bytes(content)
             init_survey(folder, area=area, name=name, values=values)
         except BaseException:
-            toml.unlink(missing_ok=True)
             area.unlink(missing_ok=True)
             raise
 
