@@ -174,13 +174,13 @@ def offer(command: str, *words: object) -> str:
     return shlex.join(["alice-survey", *command.split(), *map(str, words)])
 
 
-def pip_install(extra: str) -> str:
-    """The command that installs what an extra of this package names: PyPI has it all."""
+def extra(name: str) -> str:
+    """The command that installs what an extra of this package names, all of which PyPI has."""
     from importlib.metadata import requires
 
-    named = [one.partition(";") for one in requires("alice-survey") or ()]
-    needed = [name.strip() for name, _, where in named if re.search(rf"['\"]{extra}['\"]", where)]
-    return shlex.join(["pip", "install", *needed])
+    of_extra = re.compile(rf"(.*?)\s*;.*\bextra == ['\"]{name}['\"]")
+    found = map(of_extra.fullmatch, requires("alice-survey") or ())
+    return shlex.join(["pip", "install", *(match[1] for match in found if match)])
 
 
 NOT_GOOD_ENOUGH = 3

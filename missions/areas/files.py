@@ -57,9 +57,13 @@ _CORNERS: Sequence[tuple[str | None, *tuple[str, ...]]] = (
     (None, "north northing northings y n", "east easting eastings x e"),
 )
 """Coordinate systems, and the names of the columns of corners in them, y before x."""
+_XML = ("KML", "GPX")
 _PARTS = ("LinearRing", "LineString", "Point", "Track", "trkseg", "rte", "wpt")
 _PLACES = ("coordinates", "coord", "trkpt", "rtept")
 """Elements of KML and GPX that are a ring, a line or a point, and those with their places."""
+_NEXT_RING = re.compile(rb"(</LinearRing>\s*)(<LinearRing)")
+_RING_APART = rb"\1</innerBoundaryIs><innerBoundaryIs>\2"
+"""ArcGIS writes several rings into one inner boundary, of which GDAL reads the last."""
 _GEOJSON_LEVELS = {"MultiPoint": 1, "MultiLineString": 1, "Polygon": 1, "MultiPolygon": 2}
 """How deep in its coordinates the rings, lines and points of a geometry are."""
 
@@ -233,10 +237,13 @@ def _geometry(read: Callable[..., Any], content: str | bytes, where: str) -> Bas
 
 def _layers(path: Path) -> list[_Layer]:
     """All layers of a file that GDAL reads, after a look at what it is."""
-    driver = DRIVERS[path.suffix.lower()]
     with gis_files(path) as files:
-        layers = [layer for file in files for layer in _gdal_layers(file, path, driver)]
-    if driver != "GeoJSON" or read_geojson(path).get("crs") is not None:
+        read = [layer for file in files for layer in gdal_layers(file, path, [])]
+    layers = [
+        _Layer(name=n, shapes=_shapes(wkb, path.name, len(read) > 1, n), crs=about["crs"])
+        for n, about, wkb, _ in read
+    ]
+    if DRIVERS[path.suffix.lower()] != "GeoJSON" or read_geojson(path).get("crs") is not None:
         return layers
     # RFC 7946 makes it WGS 84, yet older writers left out other systems: the numbers show which.
     return [
@@ -252,26 +259,38 @@ def _degrees(layer: _Layer) -> bool:
     return bool((np.abs(lat) <= 360.0).all() and (np.abs(lon) <= 360.0).all())
 
 
-def _gdal_layers(file: Path, shown: Path, driver: str) -> list[_Layer]:
-    """The layers with geometry of a file that lies at `file` and that the user knows as `shown`."""
+def gdal_layers(
+    file: Path, shown: Path, columns: Sequence[str] | None = None
+) -> list[tuple[str, Any, Any, Any]]:
+    """The layers with geometry of a file.
+
+    Args:
+        file: as `gis_files` has it.
+        shown: as the user knows it.
+        columns: attributes to read; None: all.
+
+    Returns:
+        Name, description, shapes as WKB and columns of each.
+
+    Raises:
+        PlanError: it cannot be read, or rings, lines or points of it are lost.
+    """
     import pyogrio
     import pyogrio.raw
     from pyogrio.errors import DataLayerError, DataSourceError
 
-    layers = []
+    driver, layers = DRIVERS[file.suffix], []
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
-            names = pyogrio.list_layers(file)
-            for i, (name, kind) in enumerate(names.tolist()):
+            for i, (name, kind) in enumerate(pyogrio.list_layers(file).tolist()):
                 if kind is None or (driver == "GPX" and name.endswith("_points")):
                     continue
                 info = pyogrio.read_info(file, layer=i)
                 if info["driver"].removeprefix("LIB") != driver:
                     raise PlanError(f"area: {shown}: not {driver} but {info['driver']}")
-                meta, _, wkb, _ = pyogrio.raw.read(file, layer=i, columns=[], force_2d=True)
-                shapes = _shapes(wkb, shown.name, several=len(names) > 1, layer=str(name))
-                layers.append(_Layer(name=str(name), shapes=shapes, crs=meta["crs"]))
+                read = pyogrio.raw.read(file, layer=i, columns=columns, force_2d=True)
+                layers.append((str(name), read[0], read[2], read[3]))
         # pyogrio lets names that are not UTF-8 through, and trips over a damaged coordinate system.
         except (
             DataSourceError, DataLayerError, UnicodeDecodeError, UnboundLocalError, ValueError,
@@ -284,41 +303,33 @@ def _gdal_layers(file: Path, shown: Path, driver: str) -> list[_Layer]:
     for text in dict.fromkeys(str(w.message).splitlines()[0] for w in caught):
         if not text.startswith("Non closed ring"):  # reported with its feature
             warn(f"area: {shown.name}: {text}")
-    refuse_lost_parts(file, shown, [layer.shapes for layer in layers])
+    held = _parts_in(file)
+    wkb = np.concatenate([[], *(layer[2] for layer in layers)])
+    read = from_geometries(shown.name, shapely.from_wkb(wkb, on_invalid="fix")).parts
+    if held not in (None, read):
+        raise PlanError(
+            f"area: {shown}: it holds {held} rings, lines and points, of which {read} can be "
+            "read: write it again with a GIS"
+        )
     return layers
 
 
-def refuse_lost_parts(file: Path, shown: Path, read: Sequence[RawShapes]) -> None:
-    """Refuse a file of whose rings, lines and points GDAL has left out some, as it does in text.
-
-    Args:
-        file: as `gis_files` has it.
-        shown: as the user knows it.
-        read: all that was read of it.
-
-    Raises:
-        PlanError: with both numbers.
-    """
-    known = sum(one.parts for one in read)
-    kinds = {"KML": _parts_of_xml, "GPX": _parts_of_xml, "GeoJSON": _parts_of_geojson}
+def _parts_in(file: Path) -> int | None:
+    """Rings, lines and points in a text, of which GDAL passes over some; None for others."""
     kind = DRIVERS[file.suffix]
-    held = kinds[kind](file) if kind in kinds else known
-    if held != known:
-        raise PlanError(
-            f"area: {shown}: it holds {held} rings, lines and points, of which {known} can be "
-            "read: write it again with a GIS"
-        )
+    if kind == "GeoJSON":
+        return _parts_of_geojson(read_geojson(file))
+    return _parts_of_xml(file.read_bytes()) if kind in _XML else None
 
 
-def _parts_of_xml(file: Path) -> int:
-    names = [name for name in xml_names(file.read_bytes()) if name in (*_PARTS, *_PLACES)]
+def _parts_of_xml(content: bytes) -> int:
+    names = [name for name in xml_names(content) if name in (*_PARTS, *_PLACES)]
     pairs = itertools.pairwise([*names, ""])
     return sum(a == "wpt" or (a in _PARTS and b in _PLACES) for a, b in pairs)
 
 
-def _parts_of_geojson(file: Path) -> int:
-    waiting: list[Any] = [read_geojson(file)]
-    found = 0
+def _parts_of_geojson(data: Any) -> int:
+    waiting, found = [data], 0
     while waiting:
         one = waiting.pop()
         if isinstance(one, list):
@@ -333,7 +344,7 @@ def _parts_of_geojson(file: Path) -> int:
     return found
 
 
-def _shapes(wkb: Sequence[bytes | None], file: str, *, several: bool, layer: str) -> RawShapes:
+def _shapes(wkb: Sequence[bytes | None], file: str, several: bool, layer: str) -> RawShapes:
     origin = f"{file}, layer {layer}" if several else file
     geometries = []
     for i, blob in enumerate(wkb, 1):
@@ -503,25 +514,16 @@ def gis_files(path: Path) -> Iterator[list[Path]]:
             else:
                 files = [_link(path, suffix, folder)]
             kind = DRIVERS[suffix]
-            if kind in ("KML", "GPX"):
+            if kind in _XML:
                 content = read_bytes(files[0])
                 root = xml_names(content)[0]
                 if root != kind.lower():
                     raise ValueError(f"not {kind}: its first element is {root!r}")
                 files[0].unlink()
-                files[0].write_bytes(_INNER.sub(_ring_by_ring, content))
+                files[0].write_bytes(_NEXT_RING.sub(_RING_APART, content))
         except ValueError as error:
             raise PlanError(f"area: {path}: {error}") from None
         yield files
-
-
-_INNER = re.compile(rb"<innerBoundaryIs>.*?</innerBoundaryIs>", re.DOTALL)
-
-
-def _ring_by_ring(inner: re.Match[bytes]) -> bytes:
-    """An inner boundary with several rings, as ArcGIS writes it, as several: GDAL reads one."""
-    between = rb"\1</innerBoundaryIs><innerBoundaryIs>\2"
-    return re.sub(rb"(</LinearRing>\s*)(<LinearRing)", between, inner[0])
 
 
 def _link(path: Path, suffix: str, folder: Path) -> Path:

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from alice_survey.core.errors import VehicleError, pip_install
+from alice_survey.core.errors import VehicleError, extra
 from alice_survey.core.frames import Array, Datum, rotation_from_attitude
 from alice_survey.sim.vehicle import estimate_vector as vector
 from alice_survey.sim.vehicle.simulator import TICK_S
@@ -283,7 +283,7 @@ def mavlink_to(address: str, **settings: int) -> Any:
     try:
         from pymavlink import mavutil
     except ImportError:
-        raise VehicleError(f"pymavlink is not installed: {pip_install('mavlink')}") from None
+        raise VehicleError(f"pymavlink is not installed: {extra('mavlink')}") from None
     try:
         return mavutil.mavlink_connection(address, dialect="ardupilotmega", **settings)
     except (OSError, ValueError, IndexError) as error:

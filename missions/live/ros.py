@@ -26,7 +26,7 @@ from typing import Any, Literal
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from alice_survey.core.errors import VehicleError, note, pip_install, warn
+from alice_survey.core.errors import VehicleError, extra, note, warn
 from alice_survey.core.frames import Array, rotation_from_attitude
 from alice_survey.core.trajectory import Trajectory, write_track
 from alice_survey.sim.vehicle import estimate_vector as vector
@@ -101,7 +101,7 @@ def load_ros() -> RosLibrary:
     except ImportError as error:
         raise VehicleError(
             f"ROS 2 is not installed ({error}): source the setup file of an installation, or "
-            f"{pip_install('ros')}"
+            f"{extra('ros')}"
         ) from None
     return RosLibrary(rclpy=rclpy, build=MessageBuilder(message_class), qos=QoSProfile(depth=10))
 
@@ -130,7 +130,7 @@ def message_class(kind: str) -> Any:
     try:
         return getattr(importlib.import_module(f"{package}.msg"), name)
     except ImportError:
-        raise VehicleError(f"{package} of ROS 2 is not installed: {pip_install('ros')}") from None
+        raise VehicleError(f"{package} of ROS 2 is not installed: {extra('ros')}") from None
 
 
 def seconds(stamp: Any) -> float:

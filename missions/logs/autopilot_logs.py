@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.core.contents import one_line, ordinary_file
-from alice_survey.core.errors import NavigationError, pip_install, warn, why
+from alice_survey.core.errors import NavigationError, extra, warn, why
 from alice_survey.core.frames import Array, Datum
 from missions.logs.dive import (
     ROLES,
@@ -793,7 +793,7 @@ def _read_by(library: str, path: Path) -> Iterator[None]:
             raise
         except ImportError:
             raise NavigationError(
-                f"{path}: {library} is needed to read it: {pip_install('mavlink')}"
+                f"{path}: {library} is needed to read it: {extra('mavlink')}"
             ) from None
         except Exception as error:  # damaged logs raise all kinds
             raise NavigationError(

@@ -1,7 +1,6 @@
 """Figures of lines, points and polygons on a surface, drawn by a person or read from a GIS file."""
 
 import math
-import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
@@ -18,8 +17,7 @@ from alice_survey.core.errors import ConfigError, ReconstructionError, Workspace
 from alice_survey.core.frames import Array
 from alice_survey.core.products import MOSAIC
 from alice_survey.core.run import progress
-from missions.areas.files import DRIVERS, gis_files, refuse_lost_parts
-from missions.areas.raw import from_geometries
+from missions.areas.files import DRIVERS, gdal_layers, gis_files
 from reconstruct.measure.areas import (
     GridPart,
     PolygonOnGrid,
@@ -502,51 +500,35 @@ def _layers(
     part: Path, shown: Path, surface: MeasuredSurface, label: str | None
 ) -> Iterator[LabelledPolygon]:
     """The polygons of all layers of a file that the user knows as `shown`."""
-    import pyogrio
-    import pyogrio.raw
-    from pyogrio.errors import DataLayerError, DataSourceError
     from pyproj.exceptions import CRSError, ProjError
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # rings that are not closed are closed below
-        try:
-            layers = [
-                pyogrio.raw.read(part, layer=number, force_2d=True)
-                for number, (_, kind) in enumerate(pyogrio.list_layers(part).tolist())
-                if kind is not None
-            ]
-        except (DataSourceError, DataLayerError, UnicodeDecodeError, ValueError) as error:
-            raise WorkspaceError(f"{shown}: cannot be read: {one_line(error)}") from None
-        read = [shapely.from_wkb(layer[2], on_invalid="fix") for layer in layers]
-        refuse_lost_parts(part, shown, [from_geometries(shown.name, shapes) for shapes in read])
-        for (about, _, _, columns), shapes in zip(layers, read, strict=True):
-            fields = {field.lower(): n for n, field in enumerate(about["fields"].tolist())}
-            if label is not None and label.lower() not in fields:
-                known = ", ".join(fields) or "none"
-                raise WorkspaceError(f"{shown}: no attribute {label!r}; there are {known}")
-            names = _LABELS if label is None else (label.lower(),)
-            column = next((columns[fields[name]] for name in names if name in fields), None)
-            for number, geometry in enumerate(shapely.make_valid(shapes)):
-                parts = shapely.get_parts(shapely.get_parts(geometry))
-                areal = [one for one in parts if one.geom_type == "Polygon" and one.area > 0]
-                if not areal:
-                    continue
-                text = shown.stem if column is None else column[number]
-                try:
-                    placed = _place_polygon(shapely.union_all(areal), about["crs"], surface)
-                except (CRSError, ProjError) as error:
-                    raise WorkspaceError(
-                        f"{shown}: its coordinate system cannot be used: {one_line(error)}"
-                    ) from None
-                if not np.isfinite(shapely.get_coordinates(placed)).all():
-                    raise WorkspaceError(
-                        f"{shown}: a corner has no place in the survey's coordinates"
-                    )
-                yield LabelledPolygon(
-                    name=f"polygon {number + 1}",
-                    label="" if text is None else str(text),
-                    geometry=placed,
-                )
+    for _, about, shapes, columns in gdal_layers(part, shown):
+        fields = {field.lower(): n for n, field in enumerate(about["fields"].tolist())}
+        if label is not None and label.lower() not in fields:
+            known = ", ".join(fields) or "none"
+            raise WorkspaceError(f"{shown}: no attribute {label!r}; there are {known}")
+        names = _LABELS if label is None else (label.lower(),)
+        column = next((columns[fields[name]] for name in names if name in fields), None)
+        read = shapely.make_valid(shapely.from_wkb(shapes, on_invalid="fix"))
+        for number, geometry in enumerate(read):
+            parts = shapely.get_parts(shapely.get_parts(geometry))
+            areal = [one for one in parts if one.geom_type == "Polygon" and one.area > 0]
+            if not areal:
+                continue
+            text = shown.stem if column is None else column[number]
+            try:
+                placed = _place_polygon(shapely.union_all(areal), about["crs"], surface)
+            except (CRSError, ProjError) as error:
+                raise WorkspaceError(
+                    f"{shown}: its coordinate system cannot be used: {one_line(error)}"
+                ) from None
+            if not np.isfinite(shapely.get_coordinates(placed)).all():
+                raise WorkspaceError(f"{shown}: a corner has no place in the survey's coordinates")
+            yield LabelledPolygon(
+                name=f"polygon {number + 1}",
+                label="" if text is None else str(text),
+                geometry=placed,
+            )
 
 
 def _place_polygon(polygon: BaseGeometry, crs: str | None, surface: MeasuredSurface) -> Any:

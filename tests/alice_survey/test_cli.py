@@ -1,16 +1,20 @@
 """The command line: quick, with examples everywhere, one line for a known fault."""
 
+import ast
 import json
 import os
 import re
 import shlex
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from packaging.requirements import Requirement
+from PIL import Image
 from typer.main import get_command
 from typer.testing import CliRunner
 
@@ -18,6 +22,7 @@ from alice_survey.app.cli.main import app, main
 from alice_survey.app.pipeline import init_survey
 from alice_survey.app.stages import names
 from alice_survey.core.config import CameraConfig, WaterConfig, load_config
+from alice_survey.core.errors import ImageError, PlanError, extra, offer
 from camera_calib.rig import design_rig, write_rig
 
 
@@ -122,6 +127,111 @@ def test_a_refusal_is_one_line_that_names_what_is_wrong(
     assert [file.read_text() for file in files] == ["# mine"] * 2
 
 
+SQUARE = """{"type": "Polygon", "coordinates": [[
+[34.955, 32.8236], [34.9553, 32.8236], [34.9553, 32.8238], [34.955, 32.8238], [34.955, 32.8236]]]}
+"""
+
+
+def test_init_looks_at_the_area_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "dive").mkdir()
+    for name, content in (("a.jpg", b"\xff\xd8"), ("b.kml", b"\xff\xd8"), ("c.csv", b"")):
+        (tmp_path / name).write_bytes(content)
+    for area in ("a.jpg", "b.kml", "c.csv", "dive", "none.kml"):
+        done = CliRunner().invoke(app, ["init", "reef", "--area", area])
+        assert isinstance(done.exception, PlanError)
+        assert area in str(done.exception) and "\n" not in str(done.exception)
+        assert not (tmp_path / "reef").exists()
+    (tmp_path / "reef.geojson").write_text(SQUARE)
+    shown = CliRunner().invoke(app, ["init", "reef", "--area", "reef.geojson"]).output
+    assert re.findall(r"[\d.]+", shown.splitlines()[0]) == ["32.82", "34.96", "623", "2"]
+
+
+def offered(text: str) -> list[str]:
+    """Commands that a text offers."""
+    quoted = [found[2] for found in re.finditer(r"(['\"])(alice-survey .+?)\1(?!\w)", text)]
+    return quoted + re.findall(r"next: (alice-survey .+)", text)
+
+
+def parse(line: str) -> None:
+    """Let click read a command as a shell would hand it over; what it requires may lack."""
+    program, *words = shlex.split(line)
+    assert program == "alice-survey"
+    command: Any = get_command(app)
+    path = []
+    while words and words[0] in getattr(command, "commands", {}):
+        path.append(words.pop(0))
+        command = command.commands[path[-1]]
+    assert path, line
+    context = command.make_context(path[-1], [], resilient_parsing=True)
+    rest = command.make_parser(context).parse_args(words)[1]
+    assert not (hasattr(command, "commands") and rest), line
+
+
+def test_commands_that_are_offered_work_where_names_hold_spaces(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+
+    def said(*words: str) -> str:
+        done = CliRunner().invoke(app, list(words))
+        return done.output + (str(done.exception) if done.exception else "")
+
+    (tmp_path / "pictures of it").mkdir()
+    for n in range(2):
+        Image.new("RGB", (64, 48), (n, 9, 9)).save(tmp_path / "pictures of it" / f"{n}.png")
+    begin = offered(said("status", "-w", "my dive"))
+    assert begin == ["alice-survey init 'my dive'"]
+    ways = offered(said("report", "-w", "my dive")) + offered(said("plan", "-w", "my dive"))
+    (tmp_path / "int" / "images.partial").mkdir(parents=True)
+    again = offered(said("status", "-w", "int"))
+    assert [shlex.split(one)[1] for one in again] == ["import-images"]  # and not `init`
+    after = offered(said(*shlex.split(begin[0])[1:]))
+    assert after == ["alice-survey plan -w 'my dive'"]
+    empty = offered(said("status", "my dive")) + offered(said("mosaic-tiles", "-w", "my dive"))
+    real = offered(said("import-images", "pictures of it", "-w", "its dive"))
+    assert real == ["alice-survey reconstruct -w 'its dive'"]
+    for line in (*ways, *again, *after, *empty, *real):
+        parse(line)
+    assert min(map(len, (ways, empty))) >= 2
+
+
+def test_every_command_that_the_packages_name_is_one() -> None:
+    """What users are told to type; paths that are known go through `offer`."""
+    found = []
+    places = [Path(name) for name in ("alice_survey", "camera_calib", "missions", "reconstruct")]
+    for file in (file for place in places for file in place.rglob("*.py")):
+        text = file.read_text()
+        for node in ast.walk(ast.parse(text if re.search(r"alice-survey|offer\(", text) else "")):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                assert not re.search(r"alice-survey(\[| [a-z -]+-w $)", node.value), file
+                found += re.findall(r"'(alice-survey [a-z][^'{]*)'", node.value)
+            elif isinstance(node, ast.Call) and getattr(node.func, "id", "") == "offer":
+                command, *words = (getattr(word, "value", "X") for word in node.args)
+                found += [offer(command, *words)] if command != "X" else []
+    assert len(found) > 20
+    for line in found:
+        parse(line)
+
+
+@pytest.mark.parametrize("name", ["studio", "cluster", "gpu", "mavlink", "ros"])
+def test_extras_are_installed_from_where_they_are(name: str) -> None:
+    """The package itself is not on PyPI."""
+    wanted = tomllib.loads(Path("pyproject.toml").read_text())["project"]["optional-dependencies"]
+    pip, install, *needed = shlex.split(extra(name))
+    assert [pip, install] == ["pip", "install"]
+    assert {Requirement(one).name for one in needed} == {Requirement(w).name for w in wanted[name]}
+
+
+def test_a_file_is_no_workspace_and_no_folder_of_pictures(tmp_path: Path) -> None:
+    Image.new("RGB", (64, 48)).save(file := tmp_path / "p.jpg")
+    for words in (["status"], ["reconstruct"], ["quality"]):
+        assert CliRunner().invoke(app, [*words, "-w", str(file)]).exit_code == 2
+    done = CliRunner().invoke(app, ["import-images", str(file), "-w", str(tmp_path / "w")])
+    assert isinstance(done.exception, ImageError)
+    assert not (tmp_path / "w" / "images").exists()
+
+
 @pytest.mark.parametrize(("where", "named"), [("reef", "../reef.geojson"), (".", "reef.geojson")])
 def test_init_names_the_area_from_the_folder_of_the_settings(
     where: str, named: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -130,7 +240,7 @@ def test_init_names_the_area_from_the_folder_of_the_settings(
     here = tmp_path / "here"
     here.mkdir()
     monkeypatch.chdir(here)
-    (here / "reef.geojson").write_text("{}")
+    (here / "reef.geojson").write_text(SQUARE)
     path = init_survey(Path(where), area=Path("reef.geojson"))
     assert f'file = "{named}"' in path.read_text()
     moved = here.rename(tmp_path / "moved")

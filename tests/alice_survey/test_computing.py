@@ -18,6 +18,7 @@ from alice_survey.app.computing import (
     stage_costs,
     total_cost,
 )
+from alice_survey.app.stages import spec
 from alice_survey.core.artefacts import StageRecord
 from alice_survey.core.config import ReconstructConfig
 
@@ -79,19 +80,24 @@ def test_cost_grows_with_pictures_and_no_faster_than_they_do() -> None:
 
 
 def test_what_has_run_here_corrects_what_is_left() -> None:
+    def record(stage: str, cpu_s: float, processor: str = "this") -> StageRecord:
+        return StageRecord(cpu_s=cpu_s, processor=processor, command=spec(stage).command)
+
     costs = dict.fromkeys(PREDICTED, COST)
-    ran = StageRecord(cpu_s=135.0, processor="this")
+    ran = record("image", 135.0)
     records = {
-        "plan": ran,
+        "plan": record("plan", 135.0),
         "image": ran,
-        "mapping": StageRecord(cpu_s=45.0, processor="this"),
-        "dense": StageRecord(cpu_s=900.0, processor="another"),
+        "mapping": record("mapping", 45.0),
+        "dense": record("dense", 900.0, "another"),
     }
 
     assert correction(costs, records, "this") == (1.0, 1.0, ["image", "mapping"])
     assert correction(costs, {"image": ran}, "this") == (1.5, math.sqrt(1.5), ["image"])
     assert correction(costs, {"image": ran}, "that") == (1.0, 1.0, [])
-    many = dict.fromkeys(PREDICTED[:-1], ran)
+    copied = StageRecord(cpu_s=0.1, processor="this", command="import-images")
+    assert correction(costs, {"image": copied}, "this") == (1.0, 1.0, [])
+    many = {stage: record(stage, 135.0) for stage in PREDICTED[:-1]}
     ratio, factor, names = correction(costs, many, "this")
     assert ratio == 1.5 > factor > 1.4
     assert names == [*PREDICTED[:-1]]

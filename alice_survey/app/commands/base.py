@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 import typer
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, field_validator
 
-from alice_survey.core.errors import ConfigError, note, offer, pip_install
+from alice_survey.core.errors import ConfigError, extra, note, offer
 
 if TYPE_CHECKING:
     from alice_survey.core.executor import Executor
@@ -239,7 +239,7 @@ def is_gpu_chosen(choice: Choice) -> bool:
     if choice == "cpu":
         return False
     if find_spec("numba_cuda") is None:
-        name, missing = None, pip_install("gpu")
+        name, missing = None, extra("gpu")
     else:
         name, missing = _first_gpu()
     if name is not None:
@@ -256,8 +256,8 @@ def _first_gpu() -> tuple[str | None, str]:
     try:
         from numba import cuda
     except ImportError as error:
-        return None, f"numba-cuda cannot be loaded ({error}): {pip_install('gpu')}"
+        return None, f"numba-cuda cannot be loaded ({error}): {extra('gpu')}"
     if not cuda.is_available():
         why = " ".join(str(cuda.cuda_error() or "no NVVM").split())
-        return None, f"no NVIDIA GPU answers ({why}): install its driver; {pip_install('gpu')}"
+        return None, f"no NVIDIA GPU answers ({why}): install its driver; {extra('gpu')}"
     return getattr(cuda.gpus[0], "name", "simulated"), ""  # numba's simulator has no name

@@ -47,10 +47,10 @@ try:
         WorkspaceFiles,
     )
 except ImportError as missing:
-    from alice_survey.core.errors import WorkspaceError, pip_install
+    from alice_survey.core.errors import WorkspaceError, extra
 
     raise WorkspaceError(
-        f"the studio needs {missing.name}, which is not installed: {pip_install('studio')}"
+        f"the studio needs {missing.name}, which is not installed: {extra('studio')}"
     ) from None
 
 from alice_survey.app.studio import endpoints

@@ -28,15 +28,7 @@ from alice_survey.core.artefacts import refuse_links
 from alice_survey.core.cluster.worker import Answer, RunSite, code_and_versions, run_task, why_unfit
 from alice_survey.core.config import Config
 from alice_survey.core.contents import first_fault, ordinary_file, parse_toml
-from alice_survey.core.errors import (
-    AliceError,
-    ConfigError,
-    WorkspaceError,
-    note,
-    pip_install,
-    warn,
-    why,
-)
+from alice_survey.core.errors import AliceError, ConfigError, WorkspaceError, extra, note, warn, why
 from alice_survey.core.executor import Executor, Item, Result, TaskResult, default_threads, in_order
 from alice_survey.core.run import progress
 from alice_survey.core.run.resources import count_elsewhere
@@ -107,7 +99,7 @@ def _connect(config: ClusterConfig) -> Iterator["Client"]:
         from distributed import Client
     except ImportError:
         raise WorkspaceError(
-            f"a cluster needs Dask: {pip_install('cluster')}, here and on the workers"
+            f"a cluster needs Dask: {extra('cluster')}, here and on the workers"
         ) from None
     for name in ("distributed", "distributed.client"):
         logging.getLogger(name).setLevel(logging.CRITICAL)  # what ends a run is reported here

@@ -28,3 +28,14 @@ def test_numbers_have_units_that_fit_and_the_digits_of_their_sigma(
     name: str, values: list[Any], expected: str
 ) -> None:
     assert getattr(words, name)(*values) == expected
+
+
+def test_figures_of_nested_values_have_names_and_units() -> None:
+    values = {
+        "cameras": {"registered": 1200, "rms_mm": 0.7823, "turn_mm": [0.265, 0.201]},
+        "surface": {"within_px": {"1": 0.977}, "dome_mm": None}, "mesh": None,
+    }  # fmt: skip
+    assert dict(words.figure_rows(values)) == {
+        "cameras registered": "1,200", "cameras rms": "0.782 mm", "cameras turn": "0.265, 0.201 mm",
+        "surface within px 1": "0.977", "surface dome": "unknown", "mesh": "unknown",
+    }  # fmt: skip

@@ -169,6 +169,9 @@ def test_mixed_shapes_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert area.survey.area == pytest.approx(both.area, rel=2e-3)
     buoys = write(tmp_path / "buoys.gpkg", [Point(700000, 3640000)], "GPKG")
     assert "1 point" in refusal(file=buoys)
+    write(buoys, [line], "GPKG", layer="cable", append=True)
+    assert area_of(file=buoys, corridor_width_m=4.0).survey.area == pytest.approx(160, rel=1e-2)
+    assert "'buoys'" in capsys.readouterr().err
 
 
 def test_a_ring_that_is_not_closed_is_closed(
@@ -181,6 +184,14 @@ def test_a_ring_that_is_not_closed_is_closed(
     assert "open.geojson: feature 1" in capsys.readouterr().err
     closed = [(lat, lon) for lon, lat, _ in ring]
     assert area.survey.area == pytest.approx(area_of(polygon_latlon_deg=closed).survey.area)
+
+
+def lost(kind: str, places: str) -> tuple[str, bytes, str]:
+    """GeoJSON with a triangle, and with something that GDAL passes over."""
+    good = '{"type": "Polygon", "coordinates": [[[0, 0], [1, 0], [1, 1], [0, 0]]]}'
+    bad = f'{{"type": "{kind}", "coordinates": {places}}}'
+    text = f'{{"type": "GeometryCollection", "geometries": [{good}, {bad}]}}'
+    return "a.geojson", text.encode(), "of which 1 can"
 
 
 BOMB = (
@@ -214,6 +225,17 @@ BOMB = (
         ("a.wkt", b"GEOMETRYCOLLECTION (" * 50_000, "20 brackets"),
         ("a.wkt", b"SRID=" + b"9" * 40 + b";POLYGON ((0 0, 1 0, 1 1, 0 0))", "SRID=999"),
         ("a.dxf", b"0", "'.dxf'"),
+        ("a.jpg", b"\xff\xd8\xff\xe0", "'.jpg'"),
+        ("a.poly", b"", "is empty"),
+        ("a.poly", b"reef\n1\n 34.955 32.82\nEND\n", "line 1"),
+        ("a.csv", b"lat,lon\n32.8,34.9\n0,0\n", "line 3"),
+        ("a.csv", b"lat,lon\n32.8,34.9\n-9999,34.9\n", "line 3"),
+        ("a.csv", b"name,depth\na,3\n", "name, depth"),
+        ("a.waypoints", b"QGC WPL 110\n", "route"),
+        ("a.gpx", b"<kml/>", "'kml'"),
+        lost("Circle", "[1]"),
+        lost("Polygon", "[[0, 0], [1, 0]]"),
+        lost("MultiPolygon", "[[0]]"),
     ],
 )
 def test_files_that_are_not_what_they_say_are_refused(
@@ -224,6 +246,47 @@ def test_files_that_are_not_what_they_say_are_refused(
     message = refusal(file=file)
     assert named in message
     assert "<DRIVER>" not in message and "SHAPE_RESTORE" not in message
+
+
+ROUND = [(34.955, 32.8236), (34.9556, 32.8236), (34.9556, 32.824), (34.955, 32.824)]
+HOLES = [shapely.box(x, 32.8237, x + 1e-4, 32.8238).exterior.coords for x in (34.9551, 34.9554)]
+NEXT = "</innerBoundaryIs><innerBoundaryIs>"
+
+
+@pytest.mark.parametrize("between", ["", "\n ", NEXT])
+def test_every_ring_of_an_inner_boundary_is_a_hole(between: str, tmp_path: Path) -> None:
+    file = write(tmp_path / "a.kml", [Polygon(ROUND, HOLES)], "KML", "EPSG:4326")
+    text = file.read_text()
+    assert NEXT in text
+    file.write_text(text.replace(NEXT, between))
+    area = area_of(file=file)
+    assert len(area.no_go.geoms) == 2
+    assert area.no_go.area == pytest.approx(2 * 103.8, rel=1e-3)
+    point = "<Point><coordinates>34.955,32.8236</coordinates></Point>"
+    for old, new in ((NEXT, "<!-- -->"), ("</Polygon>", f"</Polygon>{point}")):
+        file.write_text(text.replace(old, new))
+        assert "a.kml" in refusal(file=file)
+
+
+def test_corners_and_closed_tracks_are_the_same_polygon(tmp_path: Path) -> None:
+    ends = [*ROUND, ROUND[0]]
+    metres = [TO_UTM.transform(x, y) for x, y in ROUND]
+    track, route = (
+        "".join(f'<{tag} lat="{y}" lon="{x}"/>' for x, y in ends) for tag in ("trkpt", "rtept")
+    )
+    texts = {
+        "a.csv": "name;lat;lon\n" + "".join(f"x;{y};{x}\n" for x, y in ROUND),
+        "a.poly": "#saved\n" + "".join(f"{y} {x}\n" for x, y in ROUND),
+        "b.csv": "Easting,Northing\n" + "".join(f"{e:.4f},{n:.4f}\n" for e, n in metres),
+        "a.gpx": f"<gpx><trk><trkseg>{track}</trkseg><trkseg/></trk></gpx>",
+        "b.gpx": f"<gpx><rte>{route}</rte></gpx>",
+    }
+    expected = area_of(polygon_latlon_deg=[(y, x) for x, y in ROUND]).survey
+    for name, text in texts.items():
+        (tmp_path / name).write_text(text)
+        area = area_of(file=tmp_path / name, crs=UTM if name == "b.csv" else None)
+        assert area.survey.symmetric_difference(expected).area < 1e-2
+    assert "crs" in refusal(file=tmp_path / "b.csv")
 
 
 def test_missing_files_and_folders_are_refused(tmp_path: Path) -> None:
