@@ -269,7 +269,8 @@ def _trigger_times(
     if not found:
         raise ImageError(f"{triggers}: holds none of the pictures, such as {lost[0]}")
     if lost:
-        warn(f"not in {triggers}, and left out: {count(len(lost), 'picture')}: {files.list_names(lost)}")
+        names = f"{count(len(lost), 'picture')}: {files.list_names(lost)}"
+        warn(f"not in {triggers}, and left out: {names}")
     return found
 
 
