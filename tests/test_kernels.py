@@ -1,11 +1,14 @@
 """How often the kernels of the tutorial's commands are compiled."""
 
+import json
 import pickle
 from collections import defaultdict
 from pathlib import Path
 
 import pytest
 
+from alice_survey.core.compiled import TABLE
+from tests.kernels import compiled_by
 from tests.small_survey import settings_in, start
 
 pytestmark = pytest.mark.slow
@@ -38,4 +41,13 @@ def test_the_kernels_of_a_survey_have_one_version_each(
         versions[index.name.rpartition("-")[0]].update(kept)
     counts = {name: len(kinds) for name, kinds in versions.items()}
     assert not {name: n for name, n in counts.items() if n > ALLOWED.get(name, 1)}
-    assert len(versions) > 200
+    table = json.loads(TABLE.read_text())  # else: python -m tests.kernels
+    named = [name.split(".") for part in table.values() for name in part]
+    own = {".".join(x[-3 if x[-1] == "entry" else -2 :]) for x in named}
+    assert own == set(versions)
+
+
+def test_a_command_compiles_the_kernels_of_its_table(tmp_path: Path) -> None:
+    found = compiled_by("plan", settings_in(tmp_path / "survey"), tmp_path / "kernels")
+    table = json.loads(TABLE.read_text())
+    assert {stage: set(part) for stage, part in found.items()} == {"plan": set(table["plan"])}

@@ -8,9 +8,11 @@ enough for a package that is installed and not edited.
 """
 
 import hashlib
+import json
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from types import CodeType, FunctionType, ModuleType, SimpleNamespace
 from typing import Any, ParamSpec, TypeVar, cast, overload
@@ -23,13 +25,17 @@ from numba.core.compiler import Compiler, CompileResult
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.registry import CPUDispatcher
 
-from alice_survey.core.errors import note
 from alice_survey.core.run.resources import user_lock
 
 _MAX_WAIT_S = 120.0
 """For another process that compiles the same kernel."""
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
+_KERNELS: dict[str, Any] = {}
+"""By module and name."""
+_kept: set[str] = set()
+"""Names of those that this machine has compiled."""
+TABLE = Path(__file__).with_name("kernels.json")
 _CONSTANTS = (bool, int, float, complex, str, bytes, tuple, np.ndarray, np.generic)
 
 
@@ -72,6 +78,7 @@ def _compile_and_keep(plain: Callable[..., Any], options: dict[str, Any]) -> Any
         index._source_stamp = _Stamp(kernel)
         index._load_index = _readable(index._load_index)
         kernel.compile = _once_a_machine(kernel)
+        _KERNELS[f"{plain.__module__}.{plain.__qualname__}"] = kernel
     return kernel
 
 
@@ -213,17 +220,40 @@ def closure_digest(kernel: Any) -> str:
     return digest.hexdigest()
 
 
-def note_compiling(kernel: Any, what: str) -> None:
-    """Report, in one line on standard error, that the first call after an installation waits.
+def left_to_compile(stage: str = "") -> dict[str, float]:
+    """Kernels of a stage that this machine is still to compile, and how long each takes.
 
     Args:
-        kernel: one that is compiled last, by `compiled`.
-        what: what is compiled, and how long it takes.
+        stage: name of its folder; of all stages without, and for work that is none of them.
+
+    Returns:
+        Seconds on a machine that was measured (`python -m tests.kernels`), for kernels that are
+        imported by now.
     """
-    stats = kernel.stats
-    kept = Path(stats.cache_path).glob(f"*{kernel.__name__}*.nbi")
-    if not stats.cache_hits and not stats.cache_misses and not any(kept):
-        note(f"compiling {what}")
+    table = _seconds()
+    of_all = {name: seconds for part in table.values() for name, seconds in part.items()}
+    return {name: s for name, s in table.get(stage, of_all).items() if _is_missing(name)}
+
+
+@cache
+def _seconds() -> dict[str, dict[str, float]]:
+    """Seconds that kernels take to compile, by stage and name."""
+    found: dict[str, dict[str, float]] = json.loads(TABLE.read_text(encoding="utf-8"))
+    return found
+
+
+def _is_missing(name: str) -> bool:
+    """Whether a kernel that is imported has no version that is kept."""
+    kernel: Any = _KERNELS.get(name.removesuffix(".entry"))
+    if kernel is None or name in _kept:
+        return False
+    # What it calls may not be defined yet, and its digest is kept.
+    if getattr(sys.modules[kernel.__module__].__spec__, "_initializing", False):
+        return False
+    part = kernel.entry if name.endswith(".entry") else kernel
+    if part._cache._cache_file._load_index():
+        _kept.add(name)
+    return name not in _kept
 
 
 def _readable(load: Callable[[], dict[Any, str]]) -> Callable[[], dict[Any, str]]:

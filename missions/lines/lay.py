@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
-from alice_survey.core.compiled import note_compiling
 from alice_survey.core.errors import PlanError
 from alice_survey.core.frames import Array
 from alice_survey.core.run import progress
@@ -105,7 +104,6 @@ def lay_lines(task: LineTask, heading_rad: float) -> list[Line]:
         PlanError: there are too many stations, no line can be flown, or there is no way inside the
             allowed area between two lines.
     """
-    note_planner()
     check_size(task.area, task.pattern, task.max_stations)
     result = lay_pattern(task, heading_rad)
     stations = int(result.steps.sum()) + len(result.steps)
@@ -136,11 +134,6 @@ def order_lines(
     table = np.array([(*x.start_ne_m, *x.end_ne_m, x.heading_rad) for x in flown])
     _connected_m(*stops(table, home), ways)
     return flown
-
-
-def note_planner() -> None:
-    """Report that the first plan after an installation waits until the planner is compiled."""
-    note_compiling(rows.lay_pieces, "the planner, once: this takes some 20 s")
 
 
 def check_size(area: Area, pattern: Pattern, max_stations: int = MAX_STATIONS) -> None:

@@ -25,7 +25,7 @@ from alice_survey.core.executor import progress
 from alice_survey.core.frames import Array
 from alice_survey.core.run.progress import step
 from missions.lines import cells, hops, rows
-from missions.lines.lay import LineTask, check_size, lay_pattern, note_planner, survey_pieces
+from missions.lines.lay import LineTask, check_size, lay_pattern, survey_pieces
 from missions.values.pattern import Pattern
 
 _ESTIMATES = 1800
@@ -77,7 +77,6 @@ def best_heading(task: LineTask) -> Sweep:
     Raises:
         PlanError: the area is too large, or cannot be flown at any heading.
     """
-    note_planner()
     check_size(task.area, task.pattern)
     width_heading, width = min_width(task.site.survey)
     close: dict[float, float] = {}

@@ -14,6 +14,7 @@ import shlex
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections import deque
@@ -28,13 +29,14 @@ from pydantic import Field, ValidationError
 
 from alice_survey.app.commands import COMMANDS
 from alice_survey.app.commands.base import CommandModel
-from alice_survey.app.pipeline import is_locked
+from alice_survey.app.pipeline import init_survey, is_locked
 from alice_survey.app.stages import STAGES
 from alice_survey.core.artefacts import JsonRecord, refuse_links
 from alice_survey.core.contents import as_line, first_fault
 from alice_survey.core.errors import NOT_GOOD_ENOUGH, AliceError, ConfigError, WorkspaceError, why
 from alice_survey.core.run.events import Event, event_text
 from alice_survey.core.run.interrupts import for_other_programs
+from alice_survey.core.settings_text import Values
 
 RECORD, OUTPUT, ERRORS, EVENTS = "job.json", "output.txt", "errors.txt", "events.jsonl"
 """Files of a job."""
@@ -58,6 +60,13 @@ _CODES_OF_STOP = (130, 143, 129)
 _OUTPUT_TAIL = 8192
 _PROGRAM = (sys.executable, "-P", "-m", "alice_survey")
 """This program, without modules of the folder that it is started in."""
+TRIAL: Values = {
+    "seafloor": {"grid_m": 0.02},
+    "imaging": {"scale": 6, "pool_views": 12},
+    "reconstruct": {"max_features": 1200},
+}
+"""Settings that take a few square metres from plan to report within minutes; the number of features
+is what pictures of a quarter of a megapixel hold."""
 
 KEPT_LINES = 2000
 _KEPT_WARNINGS = 100
@@ -552,6 +561,29 @@ class Jobs:
         self._publish(
             "run", {"job": None, "last": record.to_json(), "elsewhere": False, "ended": True}
         )
+
+
+def compile_survey(ending: threading.Event) -> None:
+    """Do the whole loop of a small survey where nobody sees it, so that its kernels are compiled.
+
+    It takes what no other program computes with, on one core.
+
+    Args:
+        ending: set where it is to stop.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        init_survey(Path(folder), values={**TRIAL, "area": {"length_m": 1.3, "width_m": 1.5}})
+        command = [*_PROGRAM, "run", "--accept", "--threads=1", f"--workspace={folder}"]
+        with for_other_programs():
+            process = psutil.Popen(
+                command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL, start_new_session=True, env=_environment(),
+            )  # fmt: skip
+        process.nice(getattr(psutil, "IDLE_PRIORITY_CLASS", 19))
+        while process.poll() is None and not ending.wait(_POLL_S):
+            pass
+        process.kill()
+        process.wait()
 
 
 def _remove(folder: Path) -> None:

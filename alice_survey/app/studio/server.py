@@ -55,12 +55,15 @@ except ImportError as missing:
 
 from alice_survey.app.studio import endpoints
 from alice_survey.app.studio.endpoints.base import Call, Content, Endpoint, Studio, json_text
-from alice_survey.app.studio.jobs import BusyError
+from alice_survey.app.studio.jobs import BusyError, compile_survey
 from alice_survey.app.studio.layers import Layers
 from alice_survey.core.artefacts import StaleError
+from alice_survey.core.compiled import left_to_compile
 from alice_survey.core.config import SurveyConfig
 from alice_survey.core.errors import AliceError, WorkspaceError, known_fault, why
+from alice_survey.core.run.events import event_of, event_text
 from alice_survey.core.run.interrupts import for_other_programs
+from alice_survey.core.run.progress import Run
 from alice_survey.core.run.resources import release_memory
 from missions.plan.preview import preview
 
@@ -71,6 +74,8 @@ _ANSWER_S = 900.0
 """Time to take an answer in: ten gigabytes by a slow disk."""
 _ENDING_S = 3
 """Time to wait at the end for answers in work."""
+_AHEAD_S = 1.0
+"""Time to wait there for the end of what compiles ahead."""
 _MAX_CONNECTIONS = 400
 HOSTS = ("127.0.0.1", "localhost")
 """Names of this machine."""
@@ -437,6 +442,31 @@ class Server:
         self.studio.jobs.close()
 
 
+class _Pages(logging.Handler):
+    """Where pages see how far a step is."""
+
+    def __init__(self, studio: Studio) -> None:
+        super().__init__()
+        self._studio = studio
+
+    def emit(self, record: logging.LogRecord) -> None:
+        event = event_of(record)
+        text = event_text(event) if event["event"] == "step_progress" else ""
+        self._studio.publish("compiling", text)
+
+
+def _compile_ahead(studio: Studio) -> None:
+    """Compile what a page will ask for, and then, while a person reads, what commands need."""
+    log = logging.Logger("compiling")
+    log.addHandler(_Pages(studio))
+    run = Run(log=log)
+    with run.stage("plan", ""):
+        preview(SurveyConfig())
+    run.close()
+    if left_to_compile():
+        compile_survey(studio.ending)
+
+
 def run_studio(
     workspace: Path, port: int, *, browser: bool, show: Callable[[str], Any], log: str | None = None
 ) -> None:
@@ -453,8 +483,8 @@ def run_studio(
         WorkspaceError: the port is taken.
     """
     server = Server(workspace, port, log=log)
-    # Imported and compiled before a page asks for it: 20 s after an installation.
-    threading.Thread(target=preview, args=(SurveyConfig(),), daemon=True).start()
+    ahead = threading.Thread(target=_compile_ahead, args=(server.studio,), daemon=True)
+    ahead.start()
     try:
         show(f"{workspace} is shown at {server.address} to this machine alone; Ctrl-C ends it")
         if browser:
@@ -465,3 +495,4 @@ def run_studio(
         server.serve_forever()
     finally:
         server.close()
+        ahead.join(_AHEAD_S)

@@ -37,6 +37,9 @@ _ALIVE_EVERY_S = 5.0
 _TICK_S = 1.0
 _PACE_S = 300.0
 """Recent time that the remaining time of a step is estimated from."""
+_COMPILES = "compiling (once on this machine)"
+_IDLE_S = 10.0
+"""Longer than a kernel takes."""
 _LEVELS = {"warning": logging.WARNING, "error": logging.ERROR}
 
 _QUANTILES = 101
@@ -130,6 +133,9 @@ class Run:
         self._steps_begun = 0
         self._lock = threading.RLock()
         self._ticks, self._closed = ticks, threading.Event()
+        self._compiling: Step | None = None
+        self._left: tuple[str, dict[str, float]] = "", {}
+        self._compiled_s = 0.0
 
     @property
     def is_quiet(self) -> bool:
@@ -199,12 +205,13 @@ class Run:
             self._report_step("step_started", step)
             return step
 
-    def advance(self, step: Step, items: int) -> None:
-        """Count more items of a step as done; report it now and then."""
+    def advance(self, step: Step, items: int, pace: float | None = None) -> None:
+        """Count more items of a step as done, at its pace; report it now and then."""
         count = f"{step.done}" if step.total is None else f"{step.done} of {step.total}"
         with self._lock:
             if step in self._steps:
-                self._bars.update(step.task.id, advance=items, count=count)
+                pace = items if pace is None else pace
+                self._bars.update(step.task.id, advance=pace, count=count)
             if self.clock() - step.reported_s >= _REPORTED_EVERY_S:
                 self._report_step("step_progress", step)
 
@@ -263,8 +270,35 @@ class Run:
             record.event = self._event(name, record.getMessage())
         return True
 
+    def watch_kernels(self, stage: str, left: dict[str, float]) -> None:
+        """Show, as a step, that kernels are compiled, in this process or in another.
+
+        Args:
+            stage: that needs them.
+            left: those that are still to compile, and the seconds that each takes.
+        """
+        with self._lock:
+            (last, before), self._left = self._left, (stage, left)
+            done = {name: s for name, s in before.items() if name not in left and stage == last}
+            if done:
+                self._compiled_s = self.clock()
+                step = self._compiling = self._compiling or self.begin_step(_COMPILES, len(before))
+                step.done, seconds = (step.done or 0) + len(done), sum(done.values())
+                step.total = step.done + len(left)
+                step.task.total = step.task.completed + seconds + sum(left.values())
+                self.advance(step, 0, seconds)
+            idle_s = self.clock() - self._compiled_s
+            if self._compiling and (not left or stage != last or idle_s > _IDLE_S):
+                self.end_step(self._compiling, complete=True)
+                self._compiling = None
+
     def _tick_often(self) -> None:
         while not self._closed.wait(_TICK_S):
+            # Loaded by what has kernels; this must load quickly.
+            if compiled := sys.modules.get("alice_survey.core.compiled"):
+                with self._lock:
+                    stage = self._stages[-1][0] if self._stages else ""
+                self.watch_kernels(stage, compiled.left_to_compile(stage))
             self.tick()
 
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from alice_survey.core.compiled import kernel, note_compiling
+from alice_survey.core.compiled import kernel
 from alice_survey.core.frames import Array, attitude_from_rotation
 from alice_survey.sim.vehicle import estimate_vector as vector
 from alice_survey.sim.vehicle.allocation import Allocation, allocate
@@ -362,7 +362,6 @@ def simulate(
     """
     from alice_survey.core.executor import progress
 
-    note_compiling(_fly_ticks, "the vehicle's model, once: this takes about half a minute")
     chunks: list[TickRows] = []
     total = math.ceil((expected_s or max_s) / TICK_S / _CHUNK_TICKS)
     found: list[Failure] = []

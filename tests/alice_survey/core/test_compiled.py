@@ -83,6 +83,24 @@ def test_only_what_python_calls_unpacks_arguments_from_objects(folder: Path) -> 
     assert ask(folder, f"{inside}; print(kernel(x=3), 0)") == (4.0, 0)
 
 
+def test_kernels_left_to_compile_are_those_imported_and_not_kept(tmp_path: Path) -> None:
+    write(tmp_path)
+    (tmp_path / "outer.py").write_text(OUTER)
+    code = """
+from alice_survey.core import compiled
+once, twice = {"inner.once": 1.0}, {"outer.twice.entry": 2.0}
+compiled._seconds = lambda: {"plan": {**once, "nowhere.at_all": 3.0}, "fly": twice}
+import outer
+left = lambda: [compiled.left_to_compile(stage) for stage in ("plan", "fly", "")]
+assert left() == [once, twice, {**once, **twice}]
+outer.twice(3.0)
+print(0.0, sum(map(len, left())))
+"""
+    assert ask(tmp_path, code) == (0.0, 0)
+    write(tmp_path, offset=2.0)  # what is kept is of no use any more
+    assert ask(tmp_path, code) == (0.0, 0)
+
+
 def test_a_kernel_is_kept_when_files_change_that_it_does_not_use(folder: Path) -> None:
     (folder / "other.py").write_text("FACTOR = 7.0\n")
     write(folder, above="# more lines\nUNUSED = 3.0\n", doc="Other words.")

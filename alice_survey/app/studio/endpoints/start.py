@@ -14,7 +14,7 @@ from pydantic import Field, RootModel
 from alice_survey.app.commands.pictures import ImportImagesCommand
 from alice_survey.app.pipeline import init_survey
 from alice_survey.app.studio.endpoints.base import Call, Endpoint, Studio
-from alice_survey.app.studio.jobs import command_of
+from alice_survey.app.studio.jobs import TRIAL, command_of
 from alice_survey.core.artefacts import StaleError, json_values, refuse_links
 from alice_survey.core.config import Config
 from alice_survey.core.errors import AliceError, WorkspaceError, why
@@ -121,13 +121,6 @@ def _count_folder(folder: Path) -> Folder:
 
 
 _MAX_BYTES = 12 << 20
-_TRIAL: Values = {
-    "seafloor": {"grid_m": 0.02},
-    "imaging": {"scale": 6, "pool_views": 12},
-    "reconstruct": {"max_features": 1200},
-}
-"""Settings that take a few square metres from plan to report within minutes; the number of features
-is what pictures of a quarter of a megapixel hold."""
 _SINGLE = tuple(suffix for suffix in SUFFIXES if suffix != ".shp")
 """Kinds of area files that are one file."""
 
@@ -195,7 +188,7 @@ class _StartPage:
         values: dict[str, Mapping[str, Any]] = {
             "area": asked.model_dump(include=area, exclude_none=True),
             "camera": asked.model_dump(include={"focal_mm"}, exclude_none=True),
-            **(_TRIAL if asked.trial else {}),
+            **(TRIAL if asked.trial else {}),
         }  # fmt: skip
         if (asked.latitude_deg is None) != (asked.longitude_deg is None):
             raise AliceError("latitude and longitude go together: give both, or neither")

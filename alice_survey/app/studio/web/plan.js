@@ -52,6 +52,7 @@ export function tab(studio) {
     el("details", {}, el("summary", {}, "Export"), exports));
   const waiting = el("p", {class: "note"}, "Planning …");
   const wait = (on) => { waiting.hidden = !on; };
+  on("compiling", (text) => { waiting.textContent = text || "Planning …"; });
   const panel = el("div", {}, waiting, content);
 
   /* ---- Planning in the background ---- */
@@ -258,8 +259,7 @@ export function tab(studio) {
    setting that would help. `apply(changes)` takes a suggestion. */
 function resultsPanel(apply) {
   const key = el("dl", {class: "plan-key"});
-  const top = el("div", {});
-  const below = el("div", {});
+  const [top, below] = [el("div"), el("div")];
   const opened = new Set(["Depth along the way"]);
   const folded = (name, title, content) => el("details", {open: opened.has(name),
     ontoggle: (event) => (event.target.open ? opened.add(name) : opened.delete(name))},
