@@ -25,6 +25,7 @@ from numba.core.compiler import Compiler, CompileResult
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.registry import CPUDispatcher
 
+from alice_survey.core.run import progress
 from alice_survey.core.run.resources import user_lock
 
 _MAX_WAIT_S = 120.0
@@ -372,3 +373,6 @@ def _text(value: Any) -> str:
     if isinstance(value, (set, frozenset)):
         return repr(sorted(map(repr, value)))
     return repr(value)
+
+
+progress.left_to_compile = left_to_compile

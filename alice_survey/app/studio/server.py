@@ -74,8 +74,6 @@ _ANSWER_S = 900.0
 """Time to take an answer in: ten gigabytes by a slow disk."""
 _ENDING_S = 3
 """Time to wait at the end for answers in work."""
-_AHEAD_S = 1.0
-"""Time to wait there for the end of what compiles ahead."""
 _MAX_CONNECTIONS = 400
 HOSTS = ("127.0.0.1", "localhost")
 """Names of this machine."""
@@ -442,23 +440,16 @@ class Server:
         self.studio.jobs.close()
 
 
-class _Pages(logging.Handler):
-    """Where pages see how far a step is."""
-
-    def __init__(self, studio: Studio) -> None:
-        super().__init__()
-        self._studio = studio
-
-    def emit(self, record: logging.LogRecord) -> None:
-        event = event_of(record)
-        text = event_text(event) if event["event"] == "step_progress" else ""
-        self._studio.publish("compiling", text)
-
-
 def _compile_ahead(studio: Studio) -> None:
     """Compile what a page will ask for, and then, while a person reads, what commands need."""
+
+    def publish(record: logging.LogRecord) -> bool:
+        event = event_of(record)
+        studio.publish("compiling", event_text(event) if "remaining_s" in event else "")
+        return False
+
     log = logging.Logger("compiling")
-    log.addHandler(_Pages(studio))
+    log.addFilter(publish)
     run = Run(log=log)
     with run.stage("plan", ""):
         preview(SurveyConfig())
@@ -495,4 +486,4 @@ def run_studio(
         server.serve_forever()
     finally:
         server.close()
-        ahead.join(_AHEAD_S)
+        ahead.join(_ENDING_S)

@@ -38,8 +38,8 @@ _TICK_S = 1.0
 _PACE_S = 300.0
 """Recent time that the remaining time of a step is estimated from."""
 _COMPILES = "compiling (once on this machine)"
-_IDLE_S = 10.0
-"""Longer than a kernel takes."""
+_IDLE_S = 5.0
+"""Besides twice the time of the longest kernel: no more is compiled then."""
 _LEVELS = {"warning": logging.WARNING, "error": logging.ERROR}
 
 _QUANTILES = 101
@@ -68,6 +68,8 @@ class Step:
         self.done = None if total is None else 0
         self.task = run.begin_task(label, total)
         self.reported_s = run.clock()
+        self.begun_s = 0.0
+        """Time spent so far on an item that is not done, where it is known."""
         self._spent: list[TaskSpent] = []
 
     def advance(self, items: int = 1, *, spent: TaskSpent | None = None) -> None:
@@ -98,7 +100,8 @@ class Step:
     @property
     def remaining_s(self) -> float | None:
         """Remaining time, from the pace of the last minutes; None where it cannot be estimated."""
-        return None if self.total is None else self.task.time_remaining
+        left_s = None if self.total is None else self.task.time_remaining
+        return None if left_s is None else max(0.0, left_s - self.begun_s)
 
 
 class Run:
@@ -280,25 +283,27 @@ class Run:
         with self._lock:
             (last, before), self._left = self._left, (stage, left)
             done = {name: s for name, s in before.items() if name not in left and stage == last}
+            step = self._compiling
             if done:
                 self._compiled_s = self.clock()
-                step = self._compiling = self._compiling or self.begin_step(_COMPILES, len(before))
+                step = self._compiling = step or self.begin_step(_COMPILES, len(before))
                 step.done, seconds = (step.done or 0) + len(done), sum(done.values())
                 step.total = step.done + len(left)
                 step.task.total = step.task.completed + seconds + sum(left.values())
                 self.advance(step, 0, seconds)
-            idle_s = self.clock() - self._compiled_s
-            if self._compiling and (not left or stage != last or idle_s > _IDLE_S):
-                self.end_step(self._compiling, complete=True)
-                self._compiling = None
+            if step is not None:
+                longest_s = max(left.values(), default=0.0) / (step.task.speed or 1.0)
+                idle_s = self.clock() - self._compiled_s
+                step.begun_s = min(idle_s, longest_s)
+                if not left or stage != last or idle_s > _IDLE_S + 2.0 * longest_s:
+                    self.end_step(step, complete=True)
+                    self._compiling = None
 
     def _tick_often(self) -> None:
         while not self._closed.wait(_TICK_S):
-            # Loaded by what has kernels; this must load quickly.
-            if compiled := sys.modules.get("alice_survey.core.compiled"):
-                with self._lock:
-                    stage = self._stages[-1][0] if self._stages else ""
-                self.watch_kernels(stage, compiled.left_to_compile(stage))
+            with self._lock:
+                stage = self._stages[-1][0] if self._stages else ""
+            self.watch_kernels(stage, left_to_compile(stage))
             self.tick()
 
 
@@ -338,6 +343,11 @@ def _progress_bars(clock: Clock, *, shown: bool) -> Progress:
         get_time=clock,
         disable=not shown,
     )
+
+
+def left_to_compile(stage: str) -> dict[str, float]:
+    """Kernels that a stage has still to compile; `core.compiled` replaces it once it is loaded."""
+    return {}
 
 
 _runs: list[Run] = []
