@@ -18,29 +18,32 @@ import sys
 from pathlib import Path
 
 COMMANDS = ("plan", "fly", "image", "calibrate", "reconstruct", "evaluate", "report", "status")
-_INNER = """
-import json, sys, time, runpy
-from collections import Counter
+INNER = """
+import json, runpy, sys, time
 from numba.core import event
+from alice_survey.core.run import progress
 class Listener(event.Listener):
-    depth, began, seconds, versions = 0, 0.0, 0.0, Counter()
+    began, inner, found = [], [0.0], {}
     def on_start(self, one):
-        self.began = self.began if self.depth else time.process_time()
-        self.depth += 1
+        self.began.append(time.thread_time())
+        self.inner.append(0.0)
     def on_end(self, one):
-        self.depth -= 1
-        kernel = one.data["dispatcher"].py_func
-        if not kernel.__module__.startswith("numba."):
-            self.versions[f"{kernel.__module__}.{kernel.__qualname__}"] += 1
-        self.seconds += 0.0 if self.depth else time.process_time() - self.began
-heard = Listener()
-event.register("numba:compile", heard)
+        took, kernel = time.thread_time() - self.began.pop(), one.data["dispatcher"].py_func
+        own = took - self.inner.pop()
+        if kernel.__module__.startswith("numba."):
+            took -= own
+        else:
+            stage = next((one for one, _ in progress.current()._stages[-1:]), "")
+            part = self.found.setdefault(stage, {})
+            part.setdefault(f"{kernel.__module__}.{kernel.__qualname__}", []).append(own)
+        self.inner[-1] += took
+event.register("numba:compile", Listener())
 try:
     sys.argv[0] = "alice-survey"
     runpy.run_module("alice_survey", run_name="__main__")
 finally:
-    with open("compiled.json", "w") as file:
-        json.dump([heard.seconds, len(heard.versions), heard.versions.total()], file)
+    with open("kernels.json", "w") as file:
+        json.dump(Listener.found, file)
 """
 
 
@@ -61,7 +64,7 @@ def main() -> None:
     options.work.mkdir(parents=True)
     page = (Path(__file__).parents[1] / "docs" / "tutorial.md").read_text()
     script = "".join(re.findall(r"^```bash\n(.*?)^```", page, re.M | re.S)[:2])
-    inner = ["-c", _INNER]
+    inner = ["-c", INNER]
     rows = {}
     home = {"HOME": str(options.work), "NUMBA_CACHE_DIR": str(options.work / "kernels")}
     bin_ = f"{Path(options.python).parent}{os.pathsep}{os.environ['PATH']}"
@@ -75,7 +78,9 @@ def main() -> None:
             threads = ["--threads", "1"] if command in ("image", "calibrate", "reconstruct") else []
             call = [options.python, *inner, command, "-w", "reef", *threads]
             subprocess.run(call, **where, capture_output=True)
-            seconds, kernels, versions = json.loads((survey / "compiled.json").read_text())
+            found = json.loads((survey / "kernels.json").read_text())
+            each = [part for stage in found.values() for part in stage.values()]
+            seconds, kernels, versions = sum(map(sum, each)), len(each), sum(map(len, each))
             rows[f"{command}, {turn}"] = (cpu_s() - before, seconds, kernels, versions)
             line = f"{cpu_s() - before:.1f} CPU s, compiling {seconds:.1f} s, {kernels} kernels"
             sys.stdout.write(f"{command}, {turn}: {line} in {versions} versions\n")

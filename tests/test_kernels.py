@@ -1,18 +1,26 @@
-"""How often the kernels of the tutorial's commands are compiled."""
+"""Which kernels the commands of a survey compile, and how often.
+
+`python -m tests.test_kernels` writes the table of their times, on a machine that does nothing else.
+"""
 
 import json
+import os
 import pickle
+import subprocess
+import sys
+import tempfile
 from collections import defaultdict
 from pathlib import Path
 
 import pytest
 
 from alice_survey.core.compiled import TABLE
-from tests.kernels import compiled_by
+from tests.first_minutes import COMMANDS, INNER
 from tests.small_survey import settings_in, start
 
 pytestmark = pytest.mark.slow
 
+ZONE = [[[0.4, 0.4], [0.8, 0.4], [0.8, 0.8], [0.4, 0.8]]]
 ALLOWED = {
     # Views of larger arrays, or arrays that may not be written to, next to whole ones.
     "correlated_fit.whiten.entry": 3,
@@ -41,13 +49,45 @@ def test_the_kernels_of_a_survey_have_one_version_each(
         versions[index.name.rpartition("-")[0]].update(kept)
     counts = {name: len(kinds) for name, kinds in versions.items()}
     assert not {name: n for name, n in counts.items() if n > ALLOWED.get(name, 1)}
-    table = json.loads(TABLE.read_text())  # else: python -m tests.kernels
+    table = json.loads(TABLE.read_text())  # else: python -m tests.test_kernels
     named = [name.split(".") for part in table.values() for name in part]
     own = {".".join(x[-3 if x[-1] == "entry" else -2 :]) for x in named}
     assert own == set(versions)
 
 
-def test_a_command_compiles_the_kernels_of_its_table(tmp_path: Path) -> None:
-    found = compiled_by("plan", settings_in(tmp_path / "survey"), tmp_path / "kernels")
-    table = json.loads(TABLE.read_text())
-    assert {stage: set(part) for stage, part in found.items()} == {"plan": set(table["plan"])}
+def test_a_first_plan_compiles_a_kernel_of_the_table_once(tmp_path: Path) -> None:
+    """Those of its cameras alone, also around a zone."""
+    survey = settings_in(tmp_path / "survey")
+    settings = survey / "survey.toml"
+    settings.write_text(settings.read_text().replace("[plan]", f"no_go_ne_m = {ZONE}\n[plan]"))
+    found = compiled_by("plan", survey, tmp_path / "kernels")
+    table = json.loads(TABLE.read_text())["plan"]
+    assert {name: len(times) for name, times in found["plan"].items()} == dict.fromkeys(table, 1)
+    assert not any(part in name for name in table for part in (".lenses.", ".dome.", ".none."))
+
+
+def compiled_by(command: str, workspace: Path, kept: Path) -> dict[str, dict[str, list[float]]]:
+    """Seconds of each version of the kernels that a command compiles, by stage and name."""
+    threads = [] if command in ("plan", "fly") else ["--threads=1"]
+    call = [sys.executable, "-c", INNER, command, "-w", str(workspace), *threads]
+    places = {"NUMBA_CACHE_DIR": str(kept), "PYTHONPATH": str(Path(__file__).parents[1])}
+    subprocess.run(
+        call, cwd=workspace, env=os.environ | places, check=True, stdout=subprocess.DEVNULL
+    )
+    found: dict[str, dict[str, list[float]]] = json.loads((workspace / "kernels.json").read_text())
+    return found
+
+
+def main() -> None:
+    """Write the table, by commands of the smallest survey that each have no kernel kept."""
+    table = dict[str, dict[str, float]]()
+    with tempfile.TemporaryDirectory() as scratch:
+        survey = settings_in(Path(scratch) / "survey")
+        for command in COMMANDS[:5]:
+            for stage, part in compiled_by(command, survey, Path(scratch) / command).items():
+                table[stage] = {k: max(0.01, round(sum(part[k]), 2)) for k in sorted(part)}
+    TABLE.write_text(json.dumps(table, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -228,7 +228,7 @@ def left_to_compile(stage: str = "") -> dict[str, float]:
         stage: name of its folder; of all stages without, and for work that is none of them.
 
     Returns:
-        Seconds on a machine that was measured (`python -m tests.kernels`), for kernels that are
+        Seconds on the machine of `python -m tests.test_kernels`, for kernels that are
         imported by now.
     """
     table = _seconds()

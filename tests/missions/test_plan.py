@@ -1,8 +1,5 @@
 import json
 import math
-import os
-import subprocess
-import sys
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -36,29 +33,6 @@ def planned(**sections: Any) -> Plan:
 
 
 SMALL = {"area": {"length_m": 4.6, "width_m": 4.0, "heading_deg": 20.0}}
-
-
-COMPILE = """
-from numba.core.event import install_recorder
-from tests.missions.test_plan import SMALL, planned
-with install_recorder("numba:compile") as seen:
-    planned(area={**SMALL["area"], "no_go_ne_m": [[[1, 1], [2, 1], [2, 2], [1, 2]]]})
-for kernel in [event.data["dispatcher"].py_func for _, event in seen.buffer if event.is_start]:
-    print(kernel.__module__, kernel.__qualname__)
-"""
-
-
-@pytest.mark.slow
-def test_a_first_plan_compiles_a_kernel_once_and_only_those_of_its_cameras(tmp_path: Path) -> None:
-    found = subprocess.check_output(
-        [sys.executable, "-c", COMPILE], text=True, cwd=Path(__file__).parents[2],
-        env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)},
-    )  # fmt: skip
-    kernels = Counter(line for line in found.splitlines() if not line.startswith("numba."))
-    assert set(kernels.values()) == {1}, kernels
-    assert not any(
-        part in kernel for kernel in kernels for part in (".lenses.", ".dome ", ".none ")
-    )
 
 
 def test_the_papers_mission(capsys: pytest.CaptureFixture[str]) -> None:

@@ -485,5 +485,5 @@ def run_studio(
                 webbrowser.open(server.address)
         server.serve_forever()
     finally:
-        server.close()
         ahead.join(_ENDING_S)
+        server.close()

@@ -292,10 +292,10 @@ class Run:
                 step.task.total = step.task.completed + seconds + sum(left.values())
                 self.advance(step, 0, seconds)
             if step is not None:
-                longest_s = max(left.values(), default=0.0) / (step.task.speed or 1.0)
+                kernel_s = max(left.values(), default=0.0) / (step.task.speed or 1.0)
                 idle_s = self.clock() - self._compiled_s
-                step.begun_s = min(idle_s, longest_s)
-                if not left or stage != last or idle_s > _IDLE_S + 2.0 * longest_s:
+                step.begun_s = min(idle_s, kernel_s)
+                if not left or stage != last or idle_s > _IDLE_S + 2.0 * kernel_s:
                     self.end_step(step, complete=True)
                     self._compiling = None
 

@@ -5,6 +5,7 @@ import json
 import os
 import signal
 import sys
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from alice_survey.app.studio.jobs import (
     JobRecord,
     Jobs,
     RunState,
+    compile_survey,
 )
 from alice_survey.core.errors import AliceError
 from tests.engines import until
@@ -289,3 +291,16 @@ def test_damaged_records_hide_a_job_at_most(
         later.state()
         assert len(later.history()) <= 1
         do(later, "quality")
+
+
+def test_what_compiles_ahead_has_the_lowest_priority_and_ends_with_the_studio() -> None:
+    ending, before = threading.Event(), psutil.Process().children()
+    ahead = threading.Thread(target=compile_survey, args=(ending,))
+    ahead.start()
+    (one,) = until(lambda: [new for new in psutil.Process().children() if new not in before])
+    until(lambda: one.nice() == 19)
+    scratch = Path(one.cmdline()[-1].partition("=")[2])
+    assert scratch.is_dir()
+    ending.set()
+    ahead.join(30.0)
+    assert not (one.is_running() or scratch.exists())
