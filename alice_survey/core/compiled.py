@@ -3,12 +3,16 @@
 numba keeps a compiled kernel as long as its file stays unchanged, although the kernels
 and constants that were compiled into it may be in other files. Here a kernel is kept as long as
 its call closure stays unchanged: its own code and options, and those of every kernel and constant
-that it reaches. A numba that stores its stamp elsewhere falls back to its own rule, which is
-enough for a package that is installed and not edited.
+that it reaches.
+
+All are compiled for x86-64-v3, whatever processor this is, so that a wheel can bring its kernels
+along and computes what a clone computes. They are read from the folder `_kernels` next to their
+module, which nobody needs to write to; what it lacks is compiled, and kept where numba keeps it.
 """
 
 import hashlib
 import json
+import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
@@ -20,13 +24,15 @@ from typing import Any, ParamSpec, TypeVar, cast, overload
 import numpy as np
 from filelock import Timeout
 from numba import njit
-from numba.core.codegen import ll
+from numba.core import caching, config
+from numba.core.codegen import get_host_cpu_features, ll
 from numba.core.compiler import Compiler, CompileResult
 from numba.core.compiler_lock import global_compiler_lock
-from numba.core.registry import CPUDispatcher
+from numba.core.registry import CPUDispatcher, cpu_target
 
+from alice_survey.core.errors import note
 from alice_survey.core.run import progress
-from alice_survey.core.run.resources import user_lock
+from alice_survey.core.run.resources import user_folder, user_lock
 
 _MAX_WAIT_S = 120.0
 """For another process that compiles the same kernel."""
@@ -38,6 +44,33 @@ _kept: set[str] = set()
 """Names of those that this machine has compiled."""
 TABLE = Path(__file__).with_name("kernels.json")
 _CONSTANTS = (bool, int, float, complex, str, bytes, tuple, np.ndarray, np.generic)
+PROCESSOR = "x86-64-v3"
+_FEATURES = {"+avx2", "+bmi", "+bmi2", "+f16c", "+fma", "+lzcnt", "+movbe"}
+"""Of that processor: Intel's since 2013, AMD's since 2015."""
+
+
+def _choose_processor() -> str:
+    """Have kernels compiled for `PROCESSOR`, in this process and in those that it starts.
+
+    Returns:
+        Why they are compiled for the processor of this machine; empty where they are not, or
+        where the environment says what they are for.
+    """
+    name, features, why = PROCESSOR, "", ""
+    if os.environ.get("NUMBA_CPU_NAME", name) != name:
+        return ""
+    if lacking := _FEATURES.difference(get_host_cpu_features().split(",")):
+        why = f"it lacks {', '.join(sorted(lacking)).replace('+', '')}"
+    elif "_toplevel_target_context" in vars(cpu_target):
+        why = "numba was in use before alice_survey was imported"
+    if why:
+        name, features = ll.get_host_cpu_name(), get_host_cpu_features()
+    os.environ.update(NUMBA_CPU_NAME=name, NUMBA_CPU_FEATURES=features)
+    config.reload_config()
+    return why
+
+
+_WHY_THIS_PROCESSOR = _choose_processor()
 
 
 @overload
@@ -73,14 +106,54 @@ def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
 
 def _compile_and_keep(plain: Callable[..., Any], options: dict[str, Any]) -> Any:
     """Compile a function, and keep the result on disk as long as its call closure is the same."""
-    kernel = njit(cache=True, **options)(plain)
-    index: Any = getattr(getattr(kernel, "_cache", None), "_cache_file", None)
-    if hasattr(index, "_source_stamp"):
-        index._source_stamp = _Stamp(kernel)
-        index._load_index = _readable(index._load_index)
+    kernel = njit(**options)(plain)
+    if isinstance(kernel, CPUDispatcher):
+        kernel._cache = _Cache(plain)
+        kernel._cache._cache_file = _Index(kernel)
         kernel.compile = _once_a_machine(kernel)
         _KERNELS[f"{plain.__module__}.{plain.__qualname__}"] = kernel
     return kernel
+
+
+class _TemporaryFolder(caching.UserWideCacheLocator):  # type: ignore[misc]
+    """Where neither the folder of the code nor the user's own may be written to."""
+
+    def __init__(self, plain: Callable[..., Any], source: str) -> None:
+        super().__init__(plain, source)
+        name = self.get_suitable_cache_subpath(source)
+        self._cache_path = str(user_folder("kernels") / name)
+
+
+class _Place(caching.CompileResultCacheImpl):  # type: ignore[misc]
+    _locator_classes = (*caching.CacheImpl._locator_classes, _TemporaryFolder)
+
+
+class _Cache(caching.FunctionCache):  # type: ignore[misc]
+    _impl_class = _Place
+
+
+class _Index(caching.IndexDataCacheFile):  # type: ignore[misc]
+    """Files of a kernel's versions by their types: those kept here, and those of the package."""
+
+    def __init__(self, kernel: Any) -> None:
+        base, stamp = kernel._cache._impl.filename_base, _Stamp(kernel)
+        super().__init__(kernel._cache.cache_path, base, stamp)
+        folder = Path(kernel.py_func.__code__.co_filename).with_name("_kernels")
+        self._shipped = caching.IndexDataCacheFile(str(folder), base, stamp)
+
+    def _load_index(self) -> dict[Any, str]:
+        files = {}
+        # It holds the classes of arguments by their names, which an older version may have had.
+        with suppress(AttributeError, ImportError):
+            files.update(super()._load_index())
+        for key, name in self._shipped._load_index().items():
+            files[key] = self._shipped._data_path(name)
+        return files
+
+    def _save_index(self, files: dict[Any, str]) -> None:
+        super()._save_index(
+            {key: file for key, file in files.items() if not Path(file).is_absolute()}
+        )
 
 
 class _InnerCompiler(Compiler):  # type: ignore[misc]
@@ -257,21 +330,6 @@ def _is_missing(name: str) -> bool:
     return name not in _kept
 
 
-def _readable(load: Callable[[], dict[Any, str]]) -> Callable[[], dict[Any, str]]:
-    """Reader of an index of compiled kernels: empty where its types cannot be found.
-
-    It holds the classes of the arguments by their names, which an older version may have had.
-    """
-
-    def load_known() -> dict[Any, str]:
-        try:
-            return load()
-        except (AttributeError, ImportError):
-            return {}
-
-    return load_known
-
-
 def _once_a_machine(kernel: Any) -> Callable[[Any], Any]:
     """What compiles a kernel for a signature, or loads what is kept.
 
@@ -285,6 +343,7 @@ def _once_a_machine(kernel: Any) -> Callable[[Any], Any]:
     def compiled_once(signature: Any) -> Any:
         if cache._index_key(signature, kernel.targetctx.codegen()) in index._load_index():
             return compile_it(signature)
+        _say_once()
         with ExitStack() as held:
             held.enter_context(global_compiler_lock)  # first: other threads may hold it
             with suppress(OSError, Timeout):  # then it is compiled once more
@@ -292,6 +351,12 @@ def _once_a_machine(kernel: Any) -> Callable[[Any], Any]:
             return compile_it(signature)
 
     return compiled_once
+
+
+@cache
+def _say_once() -> None:
+    if _WHY_THIS_PROCESSOR:
+        note(f"kernels are compiled for this processor, and kept: {_WHY_THIS_PROCESSOR}")
 
 
 class _Stamp:

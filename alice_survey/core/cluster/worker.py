@@ -7,7 +7,6 @@ import pickle
 import platform
 import socket
 import sys
-import tempfile
 import traceback
 from dataclasses import dataclass
 from functools import cache
@@ -15,7 +14,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from alice_survey.core.run.resources import versions
+from alice_survey.core.run.resources import user_folder, versions
 
 _PACKAGES = ("alice_survey", "camera_calib", "missions", "reconstruct")
 
@@ -159,10 +158,7 @@ def _prepare(host: str) -> None:
     cv2.setNumThreads(1)
     if socket.gethostname() == host or "NUMBA_CACHE_DIR" in os.environ:
         return
-    folder = Path(tempfile.gettempdir()) / f"alice-survey-kernels-{os.getuid()}"
-    folder.mkdir(mode=0o700, exist_ok=True)
-    if folder.stat().st_uid != os.getuid() or folder.stat().st_mode & 0o077:
-        return
-    os.environ["NUMBA_CACHE_DIR"] = str(folder)
-    if "numba" in sys.modules:
-        sys.modules["numba"].config.CACHE_DIR = str(folder)
+    with contextlib.suppress(PermissionError):
+        folder = os.environ["NUMBA_CACHE_DIR"] = str(user_folder("kernels"))
+        if "numba" in sys.modules:
+            sys.modules["numba"].config.CACHE_DIR = folder

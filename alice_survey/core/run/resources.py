@@ -2,6 +2,7 @@
 
 import contextlib
 import ctypes
+import errno
 import os
 import platform
 import sys
@@ -147,10 +148,21 @@ def user_lock(name: str, max_wait_s: float = -1.0) -> FileLock:
         max_wait_s: for another process, after which `filelock.Timeout` is raised; below 0
             there is no end.
     """
+    return FileLock(user_folder("locks") / f"{name}.lock", timeout=max_wait_s)
+
+
+def user_folder(name: str) -> Path:
+    """A folder on this machine that this user alone may read and write, made when it is missing.
+
+    Raises:
+        PermissionError: it belongs to someone else, who could have put into it what is run.
+    """
     user = os.getuid() if hasattr(os, "getuid") else 0
-    folder = Path(gettempdir()) / f"alice-survey-locks-{user}"
+    folder = Path(gettempdir()) / f"alice-survey-{name}-{user}"
     folder.mkdir(mode=0o700, exist_ok=True)
-    return FileLock(folder / f"{name}.lock", timeout=max_wait_s)
+    if hasattr(os, "getuid") and (folder.stat().st_uid, folder.stat().st_mode & 0o077) != (user, 0):
+        raise PermissionError(errno.EPERM, "others may write to it", str(folder))
+    return folder
 
 
 @cache

@@ -3,11 +3,13 @@
 import ast
 import os
 import re
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import llvmlite.binding as llvm
 import numpy as np
 import pytest
 from numba import njit
@@ -63,8 +65,8 @@ def asking(folder: Path) -> dict[str, str]:
     }
 
 
-def ask(folder: Path, code: str = ASK) -> tuple[float, int]:
-    environment = asking(folder)
+def ask(folder: Path, code: str = ASK, **places: str) -> tuple[float, int]:
+    environment = asking(folder) | places
     done = subprocess.run(
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
     )
@@ -142,6 +144,64 @@ run.stats = twice.stats
         (tmp_path / "outer.py").write_text(text.format(name=name))
         assert ask(tmp_path, ask_run) == (8.0, 0)
     assert ask(tmp_path, ask_run) == (8.0, 1)
+
+
+def test_kernels_of_the_package_are_loaded_from_a_folder_that_nobody_writes_to(folder):
+    shipped = folder / "_kernels"
+    shipped.mkdir()
+    for file in list((folder / "kept").rglob("*.nb[ic]")):
+        file.rename(shipped / file.name)
+    before = {file: file.read_bytes() for file in shipped.iterdir()}
+    assert ask(folder) == (8.0, 1)
+    assert not list((folder / "kept").rglob("*.nb[ic]"))
+    complex_too = ASK.replace("outer.twice(3.0)", "outer.twice(3.0) + abs(outer.twice(3.0j - 1))")
+    assert [ask(folder, complex_too) for _ in range(2)] == [(14.0, 1), (14.0, 2)]
+    assert {file: file.read_bytes() for file in shipped.iterdir()} == before
+    shutil.rmtree(shipped)  # what was kept next to it does not lead there
+    assert ask(folder, complex_too) == (14.0, 1)
+    assert ask(folder) == (8.0, 1)
+
+
+def test_kernels_are_kept_where_neither_package_nor_home_can_be_written_to(tmp_path):
+    write(tmp_path)
+    (tmp_path / "outer.py").write_text(OUTER)
+    (tmp_path / "__pycache__").touch()
+    (tmp_path / "temporary").mkdir()
+    places = {"NUMBA_CACHE_DIR": "", "HOME": "/dev/null", "XDG_CACHE_HOME": "/dev/null",
+              "TMPDIR": str(tmp_path / "temporary")}  # fmt: skip
+    assert [ask(tmp_path, **places) for _ in range(2)] == [(8.0, 0), (8.0, 1)]
+
+
+USED_BEFORE = "import numba; numba.njit(lambda x: x)(1)"
+OLD = """
+import numba.core.codegen as c; c.get_host_cpu_features = lambda: '+sse2,-avx2,+bmi'
+"""
+
+
+@pytest.mark.parametrize(
+    ("before", "given", "name", "notes"),
+    [
+        ("", None, "x86-64-v3", 0),
+        ("import numba", None, "x86-64-v3", 0),
+        (USED_BEFORE, None, llvm.get_host_cpu_name(), 1),
+        (OLD, None, llvm.get_host_cpu_name(), 1),
+        (OLD, "x86-64-v3", llvm.get_host_cpu_name(), 1),  # of the machine that started this one
+        ("", "nehalem", "nehalem", 0),
+    ],
+)
+def test_kernels_are_for_one_processor_where_this_one_has_it(folder, before, given, name, notes):
+    code = f"""
+{before}
+import os, inner, outer
+outer.twice(3.0); outer.twice(3)
+print(outer.twice.targetctx.codegen().magic_tuple()[1], os.environ["NUMBA_CPU_NAME"])
+"""
+    environment = {k: v for k, v in asking(folder).items() if not k.startswith("NUMBA_CPU")}
+    command = [sys.executable, "-c", code]
+    environment |= {} if given is None else {"NUMBA_CPU_NAME": given}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == [name, name]  # processes that it starts load the same kernels
+    assert len(done.stderr.splitlines()) == notes
 
 
 def scaled(table: np.ndarray, unit: float = 1.0) -> Callable[[int], float]:
