@@ -9,7 +9,7 @@ WORKSPACE ?= demo
 WORKERS ?= 2
 WORK ?= build/benchmarks
 
-.PHONY: help demo test test-slow test-all bench docs lint types imports structure lint-js check lock clean
+.PHONY: help demo test test-slow test-all bench docs lint types imports structure lint-js check lock wheel clean
 
 help:
 	@echo "make demo    plan, fly, image, reconstruct and score a small survey into $(WORKSPACE)/"
@@ -17,6 +17,7 @@ help:
 	@echo "make test-all  run these and the slow ones: the loop, kills, docs, browser, fuzzing, Monte Carlo"
 	@echo "make bench   run all benchmarks, for hours; table, logs and workspaces go into $(WORK)/"
 	@echo "make docs    build the site of docs/ into build/site/"
+	@echo "make wheel   build a wheel with its kernels, for this version of Python, into dist/"
 	@echo "make check   lint (Python and JavaScript), types, import rules, and the bounds of make structure"
 	@echo "make lock    renew locks/ from pyproject.toml: demo.lock, test.lock and all.lock"
 
@@ -48,6 +49,9 @@ test-all: .venv/all.ready
 
 bench: .venv/all.ready
 	$(BIN)/python -m benchmarks --work $(WORK)
+
+wheel: .venv/test.ready
+	$(BIN)/python -m tests.build_wheel --out dist
 
 docs: .venv/all.ready
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet

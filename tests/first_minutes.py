@@ -19,7 +19,7 @@ from pathlib import Path
 
 COMMANDS = ("plan", "fly", "image", "calibrate", "reconstruct", "evaluate", "report", "status")
 INNER = """
-import json, runpy, sys, time
+import json, sys, time, runpy
 from numba.core import event
 from alice_survey.core.run import progress
 class Listener(event.Listener):

@@ -1,7 +1,9 @@
 """The wheel is whole: installed in an empty environment it works outside of the checkout."""
 
 import ast
+import json
 import os
+import signal
 import subprocess
 import sys
 import venv
@@ -12,7 +14,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-pytestmark = pytest.mark.slow
+from tests.alice_survey.app.studio.test_run import loaded
+from tests.build_wheel import build
+from tests.first_minutes import INNER
+from tests.small_survey import settings_in
+from tests.test_loop import results
+
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("wheel")]
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("alice_survey", "camera_calib", "missions", "reconstruct")
 _ROS = "missions/live/ros.py"
@@ -32,13 +40,7 @@ EXTRAS: dict[str, str | tuple[str, ...]] = {
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("wheel")
-    subprocess.run(
-        [sys.executable, "-m", "pip", "wheel", str(ROOT), "--no-deps", "--no-build-isolation",
-         "--quiet", "--disable-pip-version-check", "-w", str(folder)],
-        check=True, capture_output=True, cwd=folder,
-    )  # fmt: skip
-    return next(folder.glob("alice_survey-*.whl"))
+    return build(tmp_path_factory.mktemp("wheel"), tmp_path_factory.mktemp("work"))
 
 
 @pytest.fixture(scope="module")
@@ -78,6 +80,43 @@ def test_it_holds_what_the_packages_read(wheel: Path) -> None:
     only_to_build = (".json", ".mjs", ".d.ts", "entry_map.js", "entry_mesh.js", ".gitignore")
     needed = {name for name in tracked if not name.endswith(only_to_build)}
     assert needed <= held
+
+
+def test_it_compiles_nothing_where_nobody_may_write_to_it(
+    wheel: Path, small_survey: Path, tmp_path: Path
+) -> None:
+    """As another user, who may read what root may; results are those of the clone to the byte."""
+    installed, home, reef = (tmp_path / name for name in ("installed", "home", "home/reef"))
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+    subprocess.run([*pip, "--no-deps", "--target", installed, wheel], check=True)
+    subprocess.run(["chmod", "-R", "a-w", installed], check=True)
+    settings_in(reef)
+    user: list[str] = []
+    if os.geteuid() == 0:
+        subprocess.run(["chown", "-R", "65534:65534", home], check=True)
+        may_read = [f"--{kind}-caps=+dac_read_search" for kind in ("inh", "ambient")]
+        user = ["setpriv", "--reuid=65534", "--regid=65534", "--clear-groups", *may_read]
+    places = {"PYTHONPATH": installed, "HOME": home, "TMPDIR": home, "XDG_CACHE_HOME": home}
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("NUMBA_")} | places
+
+    def compiled_by(*arguments: str) -> int:
+        command = [*user, sys.executable, "-c", INNER, *arguments, "-w", "reef"]
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        with subprocess.Popen(command, cwd=home, env=environment, **pipes) as running:
+            if arguments[0] == "studio":
+                url, token = running.stdout.readline().split()[4].split("?token=")
+                assert json.loads(loaded(f"{url}api/plan", token))["saved"]
+                running.send_signal(signal.SIGINT)
+            said = running.communicate()[1]
+        assert running.returncode in (0, 130), said
+        return int(json.loads((home / "compiled.json").read_text())[2])
+
+    commands = ("plan", "fly", "image", "calibrate", "reconstruct", "evaluate", "report", "status")
+    found = {name: compiled_by(name) for name in commands}
+    found["studio"] = compiled_by("studio", "--no-browser")
+    assert found == dict.fromkeys(found, 0)
+    assert not [*home.rglob("*.nbi"), *installed.rglob("__pycache__/*.nbi")]
+    assert results(reef) == results(small_survey)
 
 
 def test_every_import_is_a_base_dependency_or_of_an_extra(program: Path, tmp_path: Path) -> None:
