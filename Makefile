@@ -51,7 +51,7 @@ bench: .venv/all.ready
 	$(BIN)/python -m benchmarks --work $(WORK)
 
 wheel: .venv/test.ready
-	$(BIN)/python -m tests.build_wheel --out dist
+	$(BIN)/python -m tests.build_wheel dist
 
 docs: .venv/all.ready
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
