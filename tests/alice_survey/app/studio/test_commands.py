@@ -23,7 +23,7 @@ def test_the_command_line_takes_what_is_written(name: str, tmp_path: Path) -> No
         "vehicle": "alice", "controller": "sway", "dive": 1, "overlap": 0.7, "every": 2.0,
         "recursive": True, "clock_offset": -1.5, "time_zone": "Europe/Oslo",
         "vertical_datum": "-NN 2000", "dictionary": "DICT_5X5_250", "sigma": 5.0,
-        "formats": ["wpl", "cola2"],
+        "formats": ["wpl", "cola2"], "split": "left-right", "replace": True,
     }  # fmt: skip
     given = {field: examples.get(field, str(folder)) for field in OFFERED[name].offered}
     command_of(name, {}, tmp_path)  # nothing is required
