@@ -8,6 +8,8 @@ COMPILE := $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --gen
 WORKSPACE ?= demo
 WORKERS ?= 2
 WORK ?= build/benchmarks
+# Containers often forbid bytecode, which each program would compile again: 2 s of a processor for numpy and numba.
+export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: help demo test test-slow test-all bench docs lint types imports structure lint-js check lock wheel clean
 

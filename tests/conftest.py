@@ -21,6 +21,10 @@ from tests.small_survey import SMALL, settings_in, start
 # each other by spinning, which made a fit to a log take eight times the processor's time.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+# Containers often forbid bytecode, which each program that a test starts would compile again.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+
 # A shell that starts the suite in the background lets it ignore Ctrl-C, which programs inherit.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
