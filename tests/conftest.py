@@ -15,7 +15,7 @@ import pytest
 from filelock import FileLock
 from hypothesis import HealthCheck, settings
 
-from tests.small_survey import SMALL, settings_in, start
+from tests.small_survey import SMALL, TINY, settings_in, start
 
 # As the command line does, and before numpy is loaded: several threads for small matrices wait for
 # each other by spinning, which made a fit to a log take eight times the processor's time.
@@ -35,7 +35,7 @@ settings.load_profile("busy")
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("alice_survey", "camera_calib", "missions", "reconstruct")
-CACHE = ROOT / ".pytest_cache" / "small_survey"
+CACHE = ROOT / ".pytest_cache" / "surveys"
 DAILY_EXAMPLES = 25
 """Of hypothesis in `make test`; in `make test-all` as many as each test states."""
 MAX_CPU_S = 5.0
@@ -43,9 +43,16 @@ MAX_CPU_S = 5.0
 it may be three times as much, where threads share a core."""
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Begin with what takes long: at the end short tests leave no worker without work."""
+    """Begin with what takes long: at the end short tests leave no worker without work.
+
+    One worker runs all tests of a file, so that fixtures are made and kernels loaded once.
+    """
     items.sort(key=lambda item: item.get_closest_marker("slow") is None)
+    for item in items:
+        if item.get_closest_marker("xdist_group") is None:
+            item.add_marker(pytest.mark.xdist_group(str(item.path.relative_to(ROOT / "tests"))))
     for item in items if config.option.markexpr == "not slow" else ():
         function = getattr(item, "obj", None)
         stated = getattr(function, "_hypothesis_internal_use_settings", None)
@@ -89,8 +96,8 @@ def shared_data() -> Path:
 
 
 def _state() -> str:
-    """Digest of all that the small survey depends on."""
-    digest = hashlib.blake2b(f"{SMALL}{sys.version}".encode(), digest_size=8)
+    """Digest of all that the surveys depend on."""
+    digest = hashlib.blake2b(f"{SMALL}{TINY}{sys.version}".encode(), digest_size=8)
     for one in sorted(distributions(), key=lambda one: one.name):
         digest.update(f"{one.name} {one.version}".encode())
     for path in sorted(file for name in PACKAGES for file in (ROOT / name).rglob("*.[pt]*")):
@@ -99,17 +106,29 @@ def _state() -> str:
     return digest.hexdigest()
 
 
-@pytest.fixture(scope="session")
-def small_survey() -> Path:
-    """A finished workspace, made once while code and libraries stay; copy it to write into it."""
+def _survey(name: str, text: str) -> Path:
+    """A finished workspace, made once while code and libraries stay."""
     CACHE.mkdir(parents=True, exist_ok=True)
-    with FileLock(CACHE / ".lock"):
+    with FileLock(CACHE / f"{name}.lock"):
         state = _state()
-        folder = CACHE / state
+        folder = CACHE / state / name
         if not (folder / "done").exists():
-            for older in CACHE.iterdir():
+            for older in {*CACHE.iterdir()} - {CACHE / state}:
                 shutil.rmtree(older, ignore_errors=True)
-            assert start(settings_in(folder / "survey"), threads=1).wait() == 0
+            shutil.rmtree(folder, ignore_errors=True)
+            assert start(settings_in(folder / "survey", text), threads=1).wait() == 0
             if _state() == state:  # nobody edited meanwhile
                 (folder / "done").touch()
     return folder / "survey"
+
+
+@pytest.fixture(scope="session")
+def small_survey() -> Path:
+    """A survey whose results were compared with the truth; copy it to write into it."""
+    return _survey("small", SMALL)
+
+
+@pytest.fixture(scope="session")
+def tiny_survey() -> Path:
+    """A smaller one, to be compared with itself."""
+    return _survey("tiny", TINY)

@@ -31,7 +31,7 @@ from reconstruct.precision.run import (
     worst_bend,
 )
 from reconstruct.precision.tracks import ExpectedBlock, TrackModel
-from tests.small_survey import settings_in
+from tests.small_survey import SMALL, settings_in
 
 TRACKS = TrackModel(per_picture=400.0, matched=0.5, noise_px=0.1)
 FIGURES = ("bend along", "bend across", "scale", "heights", "shape")
@@ -198,7 +198,7 @@ def test_measures_are_ranked_by_what_a_minute_buys() -> None:
 
 
 def test_the_report_of_a_planned_workspace_writes_what_it_says(tmp_path: Path) -> None:
-    workspace = settings_in(tmp_path / "w")
+    workspace = settings_in(tmp_path / "w", SMALL)
     run(["plan"], workspace, None, executor=SERIAL)
     config = load_config(workspace / "survey.toml")
     text, data = precision_report(workspace, config, measures=False)
