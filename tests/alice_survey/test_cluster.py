@@ -11,6 +11,7 @@ from contextvars import copy_context
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 
 from alice_survey.core.cluster import engine
@@ -150,6 +151,13 @@ def test_what_a_killed_run_left_goes_and_what_another_uses_stays(tmp_path: Path)
             run.communicate()
 
 
+def spent_s() -> float:
+    """Processor's time of this process and those below it, what a cluster itself needs included."""
+    here = psutil.Process()
+    times = [one.cpu_times() for one in (here, *here.children(recursive=True))]
+    return float(sum(one.user + one.system for one in times))
+
+
 @pytest.mark.slow
 def test_computing_of_workers_below_this_process_counts_once(tmp_path: Path) -> None:
     file = tmp_path / "local.toml"
@@ -158,9 +166,9 @@ def test_computing_of_workers_below_this_process_counts_once(tmp_path: Path) -> 
     )
     with cluster_executor(tmp_path, None, file) as executor:
         list(executor.map(dask_tasks.compute, [0.0], label="load"))
-        meter = Meter()
+        before_s, meter = spent_s(), Meter()
         list(executor.map(dask_tasks.compute, [1.0] * 4, label="compute"))
-        assert 3.9 < meter.look()["cpu_s"] < 7.0
+        assert 3.9 < meter.look()["cpu_s"] < spent_s() - before_s + 1.0
 
 
 @pytest.mark.slow
@@ -273,7 +281,7 @@ def test_what_is_wrong_with_a_cluster_is_said_before_work(
 
 @pytest.mark.slow
 def test_a_survey_on_a_cluster_has_the_same_bytes_whatever_is_killed(
-    small_survey: Path, tmp_path: Path
+    tiny_survey: Path, tmp_path: Path
 ) -> None:
     """A worker is killed in every stage, and the scheduler in one of them."""
     workspace = settings_in(tmp_path / "survey")
@@ -301,7 +309,7 @@ def test_a_survey_on_a_cluster_has_the_same_bytes_whatever_is_killed(
         assert run.returncode == 0, said.decode()
     assert not list(workspace.glob("*.partial"))
     assert not (workspace / engine.STORE).exists()
-    here, there = results(small_survey), results(workspace)
+    here, there = results(tiny_survey), results(workspace)
     assert set(here) == set(there)
     assert not [name for name in here if here[name] != there[name]]
     steps = [json.loads(line) for line in events.read_text().splitlines()]
