@@ -139,6 +139,8 @@ def light_through(
             reach = ((z_m - start[:, 2]) / ways[:, 2])[:, None]
             places = start[:, :2] + reach * ways[:, :2]
             z_m = depth_m(places[:, 0])
+            if not z_m.any():
+                break
         return np.where(reach > 0.0, places, np.nan)
 
     return picture_light(target, np.eye(3), (camera.width_px, camera.height_px), fine, warp=hits)

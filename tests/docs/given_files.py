@@ -67,7 +67,8 @@ def boards(folder: Path, *, air: bool) -> None:
         place = folder / ("air" if air else "pool") / name
         place.mkdir(parents=True)
         for view in range(VIEWS):
-            light = light_through(target, camera, (looking.cam_from_rig[name] * poses[view]).inv())
+            board_from_cam = (looking.cam_from_rig[name] * poses[view]).inv()
+            light = light_through(target, camera, board_from_cam, fine=2)
             cv2.imwrite(str(place / f"{view:02d}.png"), to_srgb(light))
 
 
