@@ -307,7 +307,7 @@ def test_water_inside_the_nose_is_carried_where_it_is() -> None:
 @pytest.mark.parametrize(
     ("vehicle", "seconds", "at_10_ms", "at_5_ms"),
     [
-        pytest.param(m.alice(), 60, 5e-6, 1e-6, id="open-water", marks=pytest.mark.slow),
+        pytest.param(m.alice(), 20, 5e-6, 1e-6, id="open-water", marks=pytest.mark.slow),
         pytest.param(vehicle_from("alice"), 12, 2e-5, 5e-6, id="all-laws"),
     ],
 )
