@@ -32,7 +32,6 @@ from alice_survey.core.executor import Executor
 from alice_survey.core.frames import Array
 from alice_survey.core.records import MeshRecord, SurfaceRecord
 from alice_survey.core.run import progress
-from alice_survey.kit.words import count
 from reconstruct.copc import PointSpool, write_copc
 from reconstruct.evaluate.scores import read_mesh
 from reconstruct.pictures.undistorted import Pictures
@@ -284,8 +283,8 @@ def export_undistorted(workspace: Path, executor: Executor) -> tuple[str, dict[s
     folder = workspace / FOLDER
     pictures = sum(1 for path in (folder / "images").rglob("*") if path.is_file())
     text = (
-        f"undistorted: {count(pictures, 'picture')} with masks and COLMAP model (sparse/, "
-        f"sparse/0/) in {folder}"
+        f"undistorted: {pictures} pictures with masks and COLMAP model (sparse/, sparse/0/) in "
+        f"{folder}"
     )
     return text, {"pictures": pictures, "folder": str(folder)}
 

@@ -108,7 +108,7 @@ class AreaConfig(Config):
     file: Path | None = setting(
         None, "holes are no-go zones; leave out the datum above: it is its middle",
         example='"reef.geojson"',
-        above="... or a file: GeoJSON, KML, KMZ, GeoPackage, shapefile, WKT",
+        above="... or a file: GeoJSON, KML, KMZ, GPX, GeoPackage, shapefile, WKT, CSV, .poly",
     )  # fmt: skip
     layer: str | None = setting(None, "of a file that holds several", example='"survey"')
     crs: str | None = setting(

@@ -11,7 +11,7 @@ import numpy as np
 from alice_survey.core.artefacts import json_values, write_csv
 from alice_survey.core.errors import warn
 from alice_survey.core.records import CalibrationRecord
-from alice_survey.kit.words import count, with_sigma
+from alice_survey.kit.words import with_sigma
 from camera_calib.calibrate.detect_views import Detections
 from camera_calib.calibrate.solve import recalibrate
 from camera_calib.calibrate.start import locate
@@ -57,8 +57,7 @@ def write_results(folder: Path, calibration: Calibration, found: Detections) -> 
     lost = [r for r in calibration.rejections if r.points]
     if lost:
         views = ", ".join(dict.fromkeys(r.view for r in lost))
-        points = count(sum(r.points for r in lost), "point")
-        warn(f"{points} left out as outliers, of views {views}")
+        warn(f"{sum(r.points for r in lost)} points left out as outliers, of views {views}")
     for rejection in calibration.rejections:
         if not rejection.points:
             warn(f"view {rejection.view}, {rejection.camera} left out: {rejection.reason}")
@@ -160,8 +159,7 @@ def calibration_text(
     return "\n".join(
         [
             *(f"bad: {verdict['text']}" for verdict in verdicts if verdict["level"] == "bad"),
-            f"{count(len(calibration.views), 'view')}, "
-            f"{count(int(np.isfinite(square).sum()), 'point')}, "
+            f"{len(calibration.views)} views, {int(np.isfinite(square).sum())} points, "
             f"{calibration.rms_px:.3f} px rms (noise {calibration.noise_px:.3f} px)",
             *_baseline_lines(rig, target),
             *_trial_lines(calibration),

@@ -51,7 +51,6 @@ DRIVERS = {
 }  # fmt: skip
 """GDAL's drivers by the ending of a file."""
 SUFFIXES = (*DRIVERS, ".csv", ".poly", ".wkt")
-_MISSIONS = (".waypoints", ".plan", ".mission")
 _CORNERS: Sequence[tuple[str | None, *tuple[str, ...]]] = (
     ("EPSG:4326", USUAL_NAMES["latitude_deg"], USUAL_NAMES["longitude_deg"]),
     (None, "north northing northings y n", "east easting eastings x e"),
@@ -98,13 +97,10 @@ def read_area_file(
     suffix = path.suffix.lower()
     check_file(path)
     if suffix not in SUFFIXES:
-        fault = (
-            "a mission is a route, not an area: save the polygon itself, as .poly or .kml"
-            if suffix in _MISSIONS
-            else f"{suffix or 'no ending'!r} files are not read; those that are: "
+        raise PlanError(
+            f"area: {path}: {suffix or 'no ending'!r} files are not read; those that are: "
             f"{', '.join(SUFFIXES)}"
         )
-        raise PlanError(f"area: {path}: {fault}")
     if suffix in DRIVERS:
         chosen = _choose(path, _layers(path), layer, role)
     elif layer is not None:
@@ -179,13 +175,7 @@ def read_wkt(origin: str, text: str, crs: str | None) -> RawShapes:
     if match:
         text = text[match.end() :]
         stated = f"EPSG:{match.group(1)}"
-        try:
-            parse_crs(stated)
-        except PlanError:
-            raise PlanError(
-                f"area: {origin}: SRID={match.group(1)[:20]} is not a known coordinate system"
-            ) from None
-        if crs is not None and parse_crs(stated) != parse_crs(crs):
+        if parse_crs(stated) != parse_crs(stated if crs is None else crs):
             raise PlanError(f"area: {origin}: it says SRID={match.group(1)} and crs is {crs}")
         crs = stated
     if _depth(text) > _DEEPEST:

@@ -29,7 +29,6 @@ from alice_survey.core.records import (
     RangeRecord,
     RefractionRecord,
 )
-from alice_survey.kit.words import count
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from camera_calib.rig import Rig, read_rig, rig_with_mount
 from reconstruct.mapping.database import Observations, VerifiedPair
@@ -177,8 +176,7 @@ def run_mapping(
     counts = list(executor.map(extract, pictures, label="features"))
     poor = [r.image for r, n in zip(inputs.records, counts, strict=True) if n < FEW_FEATURES]
     if poor:
-        few = count(len(poor), "picture")
-        warn(f"{few} with fewer than {FEW_FEATURES} features: {list_names(poor)}")
+        warn(f"{len(poor)} pictures have fewer than {FEW_FEATURES} features: {list_names(poor)}")
     warps, distances = _warps(inputs, features, executor)
     cameras, exif_focal = _cameras(inputs, warps)
     planned = _plan_pairs(inputs, features, distances, seed, executor)

@@ -31,7 +31,6 @@ from alice_survey.core.frames import Array, Datum
 from alice_survey.core.manifest import ImageRecord
 from alice_survey.core.records import MappingRecord, PicturesRecord, ScaleRecord
 from alice_survey.core.run import progress
-from alice_survey.kit.words import count
 from camera_calib.rig import rig_with_mount
 from reconstruct.adjustment.survey_fit import AdjustedSurvey
 from reconstruct.adjustment.uncertainty import SoftModes
@@ -496,8 +495,7 @@ def picks_of_model(workspace: Path, images: Collection[str], known: Collection[s
         like = f"not in the model, whose pictures have names such as {min(images)}"
         if not found:
             raise WorkspaceError(f"no picture of the model is picked; {strange[0]} is {like}")
-        where = count(len(strange), "picture")
-        warn(f"picks in {where} are left out: {list_names(strange)}: {like}")
+        warn(f"picks in {len(strange)} pictures are left out: {list_names(strange)}: {like}")
     return found
 
 

@@ -40,11 +40,12 @@ class Survey:
 
         Args:
             folder: the workspace; created if missing.
-            area: GeoJSON, KML, GeoPackage, shapefile or WKT of the area to survey.
+            area: GeoJSON, KML, GPX, GeoPackage, shapefile, WKT or CSV of the area to survey.
             example: `survey` (the paper's mission), `demo` or `caesarea`.
 
         Raises:
             WorkspaceError: there is a `survey.toml` already, or the folder cannot be written.
+            PlanError: the file holds no area that can be surveyed.
 
         Example:
             >>> import alice_survey as alice

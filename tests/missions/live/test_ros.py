@@ -37,7 +37,7 @@ from tests.missions.live.flights import (
 )
 
 rclpy = pytest.importorskip(
-    "rclpy", reason="ROS 2 is not installed: pip install 'alice-survey[ros]'"
+    "rclpy", reason="ROS 2 is not installed: pip install '.[ros]'"
 )
 
 pytestmark = pytest.mark.xdist_group("ros")

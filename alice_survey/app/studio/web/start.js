@@ -3,7 +3,7 @@
 import {attempt, button, el, field, mayWrite, say, send, sendNewest} from "./core.js";
 import {counted, duration, gigabytes, number} from "./words.js";
 
-const AREA_FILES = ".geojson,.json,.kml,.kmz,.gpkg,.zip,.wkt";
+const AREA_FILES = ".geojson,.json,.kml,.kmz,.gpx,.gpkg,.zip,.wkt,.csv,.poly";
 /* The page of an empty workspace; `started` is called where a job has begun. */
 export function startPage(studio, {started, disk, others}) {
   const forms = {plan: planForm(studio.state.workspace), pictures: picturesForm(started, disk)};
@@ -77,7 +77,7 @@ function planForm(workspace) {
         field("Longitude, degrees", longitude)),
       el("small", {}, "Left empty, it lies at the example's place, off Haifa; all lengths are "
         + "right there too."),
-      field("Or a map file", file, "GeoJSON, KML, KMZ, GeoPackage, zipped shapefile or WKT; "
+      field("Or a map file", file, "GeoJSON, KML, GPX, GeoPackage, zipped shapefile, WKT or CSV; "
         + "its outline is then the area")),
     field("Depth of the sea floor, m", depth, "about; a chart can be given later"),
     el("div", {class: "field"}, el("label", {}, trial, " A small one, to try the program"),
