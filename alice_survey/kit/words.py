@@ -104,7 +104,7 @@ def figure_rows(values: Mapping[str, Any], of: str = "") -> Iterator[tuple[str, 
         stem, _, unit = key.rpartition("_")
         name, unit = (stem, f" {unit}") if unit in _UNITS else (key, "")
         each = [v for v in (value if isinstance(value, list) else [value]) if v is not None]
-        texts = [digits(v) if isinstance(v, float) else f"{v:,}" for v in each]
+        texts = [digits(v, 4) if isinstance(v, float) else f"{v:,}" for v in each]
         yield f"{of}{name}".replace("_", " "), ", ".join(texts) + unit if texts else "unknown"
 
 

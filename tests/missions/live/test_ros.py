@@ -36,9 +36,7 @@ from tests.missions.live.flights import (
     workspace_in,
 )
 
-rclpy = pytest.importorskip(
-    "rclpy", reason="ROS 2 is not installed: pip install '.[ros]'"
-)
+rclpy = pytest.importorskip("rclpy", reason="ROS 2 is not installed: pip install '.[ros]'")
 
 pytestmark = pytest.mark.xdist_group("ros")
 DOMAIN = {
