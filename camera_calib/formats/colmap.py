@@ -258,5 +258,4 @@ def has_ports(path: Path) -> bool | None:
     suffix = path.suffix.lower()
     if suffix in (".txt", ".bin"):
         return any(record.refraction for record in read_records(path))
-    listed = suffix == ".json" and fields.read_text(path).lstrip().startswith("[")
-    return False if listed else None
+    return False if suffix == ".json" and fields.read_text(path).lstrip()[:1] == "[" else None

@@ -7,6 +7,7 @@ import json
 import math
 import re
 from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping
+from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Self
@@ -65,18 +66,17 @@ class FileModel(BaseModel):
             value = "" if isinstance(given, dict | list) else f" ({as_line(repr(given))[:60]})"
             raise CalibrationError(f"{path}: {prefix}{first_fault(error)}{value}") from None
         if others is not None:
-            known = {*others, *cls.known_keys()}
-            name_unread(path, (prefix + key for key in values if key not in known))
+            known = [*others, *cls.known_keys()]
+            lost = {key: get_close_matches(key, known, 1) for key in {**values} if key not in known}
+            near = {key: "".join(f" ({name}?)" for name in names) for key, names in lost.items()}
+            name_unread(path, (f"{prefix}{key}{near[key]}" for key in near if values[key] != 0))
         return found
 
     @classmethod
     def known_keys(cls) -> Iterator[str]:
         """The keys of its values."""
         for name, field in cls.model_fields.items():
-            names = field.validation_alias
-            yield from (
-                names.choices if isinstance(names, pydantic.AliasChoices) else [names or name]
-            )  # type: ignore[misc]
+            yield from getattr(field.validation_alias, "choices", [field.validation_alias or name])
 
     def values(self) -> dict[str, Any]:
         """What a file holds of it, by its keys."""

@@ -50,8 +50,7 @@ def read_opencv(path: Path, reading: rigs.ReadOptions) -> Rig:
             raise CalibrationError(f"{path}: lacks R and T: name their file with --extrinsics")
         pose = _PairPose.check(reading.extrinsics or path, other)
         poses.append(RigidTransform.from_components(pose.shift, pose.rotation))
-    usual = [found.name or "cam0"] if single else ["left", "right"]
-    stated = found.names or usual
+    stated = found.names or ([found.name or "cam0"] if single else ["left", "right"])
     names = [stated] if isinstance(stated, str) else stated
     if len(names) != len(cameras):
         raise CalibrationError(f"{path}: camera_names: {len(names)}; {len(cameras)} expected")

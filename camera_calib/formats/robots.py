@@ -91,8 +91,9 @@ class _KalibrCamera(opencv_model.CameraKeys):
         if projection == "pinhole":
             return plain
         scale = depth(0.0, 1.0, *own)
-        numbers = flat / [scale, scale, 1.0, 1.0]
-        first = opencv_model.camera_of_numbers(where, numbers, size, FisheyeLens)
+        first = opencv_model.camera_of_numbers(
+            where, flat / [scale, scale, 1, 1], size, FisheyeLens
+        )
 
         def project(rays: Array) -> Array:
             across = rays[..., :2]
@@ -317,6 +318,6 @@ def read_zed(path: Path, reading: rigs.ReadOptions) -> Rig:
     numbers = fields.read_vector((6,), [stereo.get(name.lower(), 0.0) for name in names])
     other = [key for key in stereo if key not in names and "_" not in key]
     fields.name_unread(path, [*other, *(name for name in parts if "_CAM_" not in name)])
-    turn = Rotation.from_rotvec(numbers[3:])
-    pose = RigidTransform.from_components(numbers[:3] * [-1e-3, 1e-3, 1e-3], turn)
+    shift, turn = numbers[:3] * [-1e-3, 1e-3, 1e-3], Rotation.from_rotvec(numbers[3:])
+    pose = RigidTransform.from_components(shift, turn)
     return rigs.assemble(path, reading, "ZED", ["left", "right"], cameras, [*rigs.ONE, pose])
