@@ -90,10 +90,8 @@ class _KalibrCamera(opencv_model.CameraKeys):
         plain = opencv_model.camera_of_numbers(where, [*flat, *k], size, lens)
         if projection == "pinhole":
             return plain
-        scale = depth(0.0, 1.0, *own)
-        first = opencv_model.camera_of_numbers(
-            where, flat / [scale, scale, 1, 1], size, FisheyeLens
-        )
+        w = depth(0.0, 1.0, *own)
+        first = opencv_model.camera_of_numbers(where, flat / [w, w, 1.0, 1.0], size, FisheyeLens)
 
         def project(rays: Array) -> Array:
             across = rays[..., :2]
