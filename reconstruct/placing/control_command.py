@@ -439,8 +439,8 @@ def import_control(
     left = [p.name for p in found.points if p not in placed and p.name not in ends]
     if left:
         warn(
-            f"{path}: {len(left)} points are left out, whose place is missing or stands for "
-            f"unknown: {_name_some(left)}"
+            f"{path}: left out {len(left)} of {len(found.points)} points, whose place is missing "
+            f"or stands for unknown: {_name_some(left)}"
         )
     if not placed and not found.lengths:
         raise WorkspaceError(f"{path}: no point has a place")
