@@ -1,5 +1,6 @@
 """The command line, made of the classes of `alice_survey.app.commands`."""
 
+import atexit
 import gc
 import inspect
 import os
@@ -216,8 +217,9 @@ def front_door(
 def main() -> None:
     """Run the command line; a known fault is one line on standard error and exit code 1."""
     # Modules leave many objects that stay: looking through them again and again for garbage while
-    # they are loaded takes a tenth of a command's start.
+    # they are loaded takes a tenth of a command's start, and once more at its end half a second.
     gc.set_threshold(100_000)
+    atexit.register(gc.freeze)
     # Before numpy is loaded. Its threads wait for each other by spinning: products of small
     # matrices then cost several times the work, and rounding would depend on the number of cores.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
