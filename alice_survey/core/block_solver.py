@@ -274,24 +274,25 @@ def solve_symmetric(matrix: Array, right: Array) -> Array:
     and their last digits depend on the number of threads.
     """
     count, sides = matrix.shape[0], right.shape[1]
-    lower, found = np.empty((count, count)), np.empty((count, sides))
+    upper, found = matrix.T.copy(), right.copy()  # rows, along which a processor works on several
     for i in range(count):
-        for j in range(i + 1):
-            total = matrix[i, j]
-            for k in range(j):
-                total -= lower[i, k] * lower[j, k]
-            lower[i, j] = math.sqrt(total) if i == j else total / lower[j, j]
-    for m in range(sides):
-        for i in range(count):
-            total = right[i, m]
-            for k in range(i):
-                total -= lower[i, k] * found[k, m]
-            found[i, m] = total / lower[i, i]
-        for i in range(count - 1, -1, -1):
-            total = found[i, m]
-            for k in range(i + 1, count):
-                total -= lower[k, i] * found[k, m]
-            found[i, m] = total / lower[i, i]
+        for k in range(i):
+            share = upper[k, i]
+            for j in range(i, count):
+                upper[i, j] -= share * upper[k, j]
+            for m in range(sides):
+                found[i, m] -= share * found[k, m]
+        upper[i, i] = math.sqrt(upper[i, i])
+        for j in range(i + 1, count):
+            upper[i, j] /= upper[i, i]
+        for m in range(sides):
+            found[i, m] /= upper[i, i]
+    for i in range(count - 1, -1, -1):
+        for k in range(i + 1, count):
+            for m in range(sides):
+                found[i, m] -= upper[i, k] * found[k, m]
+        for m in range(sides):
+            found[i, m] /= upper[i, i]
     return found
 
 
