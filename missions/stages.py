@@ -44,7 +44,7 @@ def _fly_summary(folder: Path) -> Summary:
         f"{_metres(line.cross_track_rms_m)} cross-track rms (the control's part "
         f"{_metres(line.believed_cross_track_rms_m)}), heading {_degrees(line.heading_rms_deg)} "
         f"rms; roll in turns to {_degrees(flight.in_turns.roll_worst_deg)}; "
-        f"{flight.clearance_least_m:.2f} m above the sea floor at least; "
+        f"{flight.min_clearance_m:.2f} m above the sea floor at least; "
         f"{sum(flight.energy_wh.values()):.1f} Wh; "
         f"{share(flight.coverage.share_at_overlap)} of the area covered as requested{promised}, "
         f"{share(flight.coverage.every_camera_share)} seen by every camera; "

@@ -30,15 +30,15 @@ PACKAGES = ("alice_survey", "camera_calib", "missions", "reconstruct")
 WORDS = Path(__file__).with_name("structure_words.toml")
 """Words that are not used, and where each of them counts."""
 BOUNDS = {
-    "code lines of the packages": 70_100,  # 69,438, and a part of the reserve of 2,000
-    "code lines of the tests": 48_870,  # 48,310, and a part of the reserve of 4,000
+    "code lines of the packages": 71_350,  # 69,438, and a part of the reserve of 2,000
+    "code lines of the tests": 49_955,  # 48,310, and a part of the reserve of 4,000
     "code lines of the benchmarks": 8_000,
     "lines of our own JavaScript": 4_900,
     "modules": 393,
-    "modules with a single importer": 72,
-    "kernels": 232,
+    "modules with a single importer": 71,
+    "kernels": 241,
     "commands": 36,
-    "options of commands": 345,
+    "options of commands": 349,
     "settings": 125,
     "functions that take the whole SurveyConfig": 14,
     "layers of the import contract": 8,
@@ -47,7 +47,7 @@ BOUNDS = {
     "class names with two meanings": 0,
     "modules that import matplotlib": 2,
     "pages begun by hand (<!DOCTYPE)": 2,
-    "modules that name the flat port": 10,
+    "modules that name the flat port": 9,
     "identifiers with an avoided word": 0,
     "functions named by a participle": 0,
     "help texts with an avoided phrase": 0,

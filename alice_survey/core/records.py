@@ -97,7 +97,7 @@ class FlightRecord(JsonRecord):
     stations_planned: int
     stations_off_line: int
     allowed_cross_track_m: float
-    clearance_least_m: float
+    min_clearance_m: float
     """Of hull, port and DVL above the sea floor."""
     outside_allowed: OutsideAllowed
     on_lines: OnLines

@@ -103,7 +103,7 @@ def waypoints(
     if plan.way_depths_m:
         points = _over_terrain(points, plan.way_depths_m[plan.dives.index(dive)])
     if by_depth:
-        points = list(_rising_first(points))
+        points = list(_with_rises(points))
     glass_ne = np.array([point.place_ne_m for point in points])
     headings = np.array([point.heading_rad for point in points])
     vehicle_ne = mount.vehicle_ne(glass_ne, headings)
@@ -280,7 +280,7 @@ def _over_terrain(points: Sequence[_Point], way_depths_m: Sequence[float]) -> li
     return raised
 
 
-def _rising_first(points: Sequence[_Point]) -> Iterator[_Point]:
+def _with_rises(points: Sequence[_Point]) -> Iterator[_Point]:
     """Way-points with one more wherever the next is higher and away from a line: straight up."""
     for before, point in itertools.pairwise([points[0], *points]):
         up_m = float(before.glass_depth_m or 0.0) - float(point.glass_depth_m or 0.0)
@@ -291,7 +291,7 @@ def _rising_first(points: Sequence[_Point]) -> Iterator[_Point]:
         yield point
 
 
-def least_clearance_by_depth(
+def min_clearance_by_depth(
     plan: Plan,
     dives: Sequence[Sequence[Waypoint]],
     bathymetry: Bathymetry,
@@ -314,7 +314,7 @@ def least_clearance_by_depth(
     Returns:
         NaN where the floor is not known somewhere.
     """
-    least_m = np.inf
+    min_m = np.inf
     for points in dives:
         ne = plan.datum.ned_from_geodetic(
             np.array([(p.glass_latitude_deg, p.glass_longitude_deg, 0.0) for p in points])
@@ -330,8 +330,8 @@ def least_clearance_by_depth(
             headings = before.heading_rad + share * turned_rad
             floor_m = highest_floor(bathymetry, places, headings, reach)
             clearance_m = floor_m - np.maximum(after.glass_depth_m, climbed_m)
-            least_m = np.minimum(least_m, clearance_m.min())
-    return float(least_m)
+            min_m = np.minimum(min_m, clearance_m.min())
+    return float(min_m)
 
 
 def gone_on(plan: Plan, point: Waypoint, tolerance_m: float) -> Waypoint:

@@ -120,15 +120,15 @@ def check_exported(mission: Path) -> None:
 
 def depth_refusal(plan: Plan) -> str:
     """Why no vehicle may fly a plan over its bathymetry; empty where one may."""
-    least_m, allowed_m = plan.clearance_by_depth_m
-    if not plan.is_flown_by_depth or least_m >= allowed_m:
+    min_m, allowed_m = plan.clearance_by_depth_m
+    if not plan.is_flown_by_depth or min_m >= allowed_m:
         return ""
     if not math.isfinite(allowed_m):
         return (
             "the plan follows a bathymetry and does not say how near to it missions come: plan "
             "again"
         )
-    clearance = "an unknown clearance" if math.isnan(least_m) else f"{least_m:.2f} m of clearance"
+    clearance = "an unknown clearance" if math.isnan(min_m) else f"{min_m:.2f} m of clearance"
     return (
         f"between lines, missions for COLA2, WPL and QGroundControl would have {clearance} over "
         f"the bathymetry, less than plan.least_clearance_m {allowed_m:g}: leave the steep part out "

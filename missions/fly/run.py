@@ -353,7 +353,7 @@ def flight_summary(flight: Flight, vehicle: VehicleConfig, rig: Rig) -> dict[str
         "dives": len(plan.dives),
         "stations_off_line": flight.stations_off_line,
         "allowed_cross_track_m": flight.plan.allowed_offset_m,
-        "clearance_least_m": flight.clearance_m,
+        "min_clearance_m": flight.clearance_m,
         "outside_allowed": {
             "share_of_time": float(np.mean(flight.outside_m > 0.0)),
             "worst_m": float(flight.outside_m.max()),

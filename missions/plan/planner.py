@@ -24,7 +24,7 @@ from missions.areas.survey import survey_area
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.stations import MAX_ALTITUDES, Stations, stations_of_plan, sure_pattern
 from missions.exports.geometry import CameraMount
-from missions.exports.waypoints import least_clearance_by_depth, waypoints
+from missions.exports.waypoints import min_clearance_by_depth, waypoints
 from missions.exposure.settings import ImagingSettings, ImagingSetup, imaging_settings
 from missions.exposure.strobe import raw_bytes
 from missions.plan.parts import plan_parts
@@ -346,9 +346,9 @@ def _by_depth(
     )
     dives = [waypoints(laid, dive, mount, rate_rad_s, by_depth=True) for dive in laid.dives]
     steepest_rad = math.radians(plan.steepest_deg)
-    least_m = least_clearance_by_depth(laid, dives, bathymetry, reach, steepest_rad)
-    known_m = least_m if math.isfinite(least_m) else None
-    return {"min_clearance_m": known_m, "least_allowed_m": plan.least_clearance_m}
+    min_m = min_clearance_by_depth(laid, dives, bathymetry, reach, steepest_rad)
+    known_m = min_m if math.isfinite(min_m) else None
+    return {"min_clearance_m": known_m, "allowed_m": plan.least_clearance_m}
 
 
 def _stations(plan: Plan, bathymetry: Bathymetry | None) -> Stations:

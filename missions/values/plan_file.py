@@ -141,9 +141,9 @@ class Plan:
     @property
     def clearance_by_depth_m(self) -> tuple[float, float]:
         """Least clearance of way-points flown by depth, and the least allowed; NaN: not known."""
-        found = (self._terrain("by_depth", name) for name in ("min_clearance_m", "least_allowed_m"))
-        least_m, allowed_m = found
-        return least_m, allowed_m
+        found = (self._terrain("by_depth", name) for name in ("min_clearance_m", "allowed_m"))
+        min_m, allowed_m = found
+        return min_m, allowed_m
 
     def _terrain(self, part: str, name: str) -> float:
         known = (self.details.get("terrain") or {}).get(part) or {}

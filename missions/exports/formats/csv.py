@@ -66,21 +66,21 @@ def write_waypoints(path: Path, export: Export, _dive: int) -> None:
         {
             "number": number, "dive": dive, "latitude_deg": f"{p.glass_latitude_deg:.10f}",
             "longitude_deg": f"{p.glass_longitude_deg:.10f}", "depth_m": f"{p.glass_depth_m:.3f}",
-            "altitude_m": _known(export.mount.glass_altitude_m(p.altitude_m)),
+            "altitude_m": _metres_or_blank(export.mount.glass_altitude_m(p.altitude_m)),
             "speed_mps": p.speed_mps,
             "heading_deg": f"{math.degrees(p.heading_rad):.4f}",
             "action": p.kind + (f", camera {p.camera}" if p.camera else ""),
             "line": p.line if p.line >= 0 else None, "hold_s": f"{p.hold_s:.1f}",
             "vehicle_latitude_deg": f"{p.latitude_deg:.10f}",
             "vehicle_longitude_deg": f"{p.longitude_deg:.10f}",
-            "vehicle_depth_m": f"{p.depth_m:.3f}", "altimeter_altitude_m": _known(p.altitude_m),
+            "vehicle_depth_m": f"{p.depth_m:.3f}", "altimeter_altitude_m": _metres_or_blank(p.altitude_m),
         }
         for number, (dive, p) in enumerate(points, start=1)
     )  # fmt: skip
     _write(path, rows)
 
 
-def _known(metres: float) -> str:
+def _metres_or_blank(metres: float) -> str:
     return "" if math.isnan(metres) else f"{metres:.3f}"
 
 

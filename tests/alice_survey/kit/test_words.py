@@ -36,6 +36,7 @@ def test_figures_of_nested_values_have_names_and_units() -> None:
         "surface": {"within_px": {"1": 0.977}, "dome_mm": None}, "mesh": None,
     }  # fmt: skip
     assert dict(words.figure_rows(values)) == {
-        "cameras registered": "1,200", "cameras rms": "0.7823 mm", "cameras turn": "0.2650, 0.2010 mm",
+        "cameras registered": "1,200", "cameras rms": "0.7823 mm",
+        "cameras turn": "0.2650, 0.2010 mm",
         "surface within px 1": "0.9770", "surface dome": "unknown", "mesh": "unknown",
     }  # fmt: skip

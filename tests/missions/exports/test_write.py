@@ -18,7 +18,7 @@ from missions.exports.registry import format_names, read_mission
 from missions.exports.waypoints import (
     DEPTH_STEP_M,
     bends,
-    least_clearance_by_depth,
+    min_clearance_by_depth,
     waypoints,
 )
 from missions.exports.write import export_report, write_exports
@@ -169,9 +169,9 @@ def plan_over(wall_m: float, slope: float = 0.0, made: Callable[..., Plan] = sma
     )
     mount = CameraMount(glass_body_m=(0.55, -0.05, 0.08), altimeter_body_m=(-0.41, 0.0, 0.11))
     dives = [waypoints(plan, dive, mount, 0.3, by_depth=True) for dive in plan.dives]
-    least_m = least_clearance_by_depth(plan, dives, floor, REACH, STEEPEST_RAD)
+    min_m = min_clearance_by_depth(plan, dives, floor, REACH, STEEPEST_RAD)
     figures = terrain_figures(profiles, limits, relief_m=10.0)
-    figures["by_depth"] = {"min_clearance_m": least_m, "least_allowed_m": 1.0}
+    figures["by_depth"] = {"min_clearance_m": min_m, "allowed_m": 1.0}
     return replace(plan, details={"terrain": figures})
 
 
@@ -232,14 +232,12 @@ def test_a_way_home_over_a_wall_rises_first(tmp_path: Path) -> None:
     np.testing.assert_allclose(places[risen], places[risen - 1], atol=1e-8)
 
 
-@pytest.mark.parametrize("least_m", [0.9, -4.0, None])
+@pytest.mark.parametrize("min_m", [0.9, -4.0, None])
 def test_missions_that_come_too_near_the_floor_are_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], least_m: float | None
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], min_m: float | None
 ) -> None:
     plan = plan_over(6.0)
-    terrain = plan.details["terrain"] | {
-        "by_depth": {"min_clearance_m": least_m, "least_allowed_m": 1.0}
-    }
+    terrain = plan.details["terrain"] | {"by_depth": {"min_clearance_m": min_m, "allowed_m": 1.0}}
     near = replace(plan, details={"terrain": terrain})
     with pytest.raises(PlanError, match="clearance"):
         write_exports(tmp_path / "out", near, RIG, formats=["csv", "cola2"])
