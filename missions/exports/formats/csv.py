@@ -73,7 +73,8 @@ def write_waypoints(path: Path, export: Export, _dive: int) -> None:
             "line": p.line if p.line >= 0 else None, "hold_s": f"{p.hold_s:.1f}",
             "vehicle_latitude_deg": f"{p.latitude_deg:.10f}",
             "vehicle_longitude_deg": f"{p.longitude_deg:.10f}",
-            "vehicle_depth_m": f"{p.depth_m:.3f}", "altimeter_altitude_m": _metres_or_blank(p.altitude_m),
+            "vehicle_depth_m": f"{p.depth_m:.3f}",
+            "altimeter_altitude_m": _metres_or_blank(p.altitude_m),
         }
         for number, (dive, p) in enumerate(points, start=1)
     )  # fmt: skip
