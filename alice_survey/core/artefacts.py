@@ -17,7 +17,7 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -616,6 +616,7 @@ def read_csv(
     required: Iterable[str] = (),
     *,
     exact: bool = False,
+    known: Collection[str] = (),
     fault: type[AliceError] = NavigationError,
 ) -> tuple[list[str], list[tuple[int, dict[str, str]]]]:
     """Read a CSV file with a header.
@@ -625,6 +626,7 @@ def read_csv(
             commas, or by semicolons or tabs, and numbers may then have decimal commas.
         required: columns that must be there.
         exact: keep spaces at the ends of cells, which names of files may have; UTF-8 only.
+        known: columns that are read: a warning names others. None are named if it is empty.
         fault: type of the error.
 
     Returns:
@@ -632,10 +634,10 @@ def read_csv(
         lacks is empty.
 
     Raises:
-        AliceError: of type `fault`: the file cannot be read, lacks a column or has it twice, or has
-            a row with more cells than the header.
+        AliceError: of type `fault`: the file cannot be read, is empty, lacks a column or has it
+            twice, or has a row with more cells than the header.
     """
-    names, rows = stream_csv(path, required, exact=exact, fault=fault)
+    names, rows = stream_csv(path, required, exact=exact, known=known, fault=fault)
     return names, list(rows)
 
 
@@ -644,6 +646,7 @@ def stream_csv(
     required: Iterable[str] = (),
     *,
     exact: bool = False,
+    known: Collection[str] = (),
     fault: type[AliceError] = NavigationError,
 ) -> tuple[list[str], Iterator[tuple[int, dict[str, str]]]]:
     """As `read_csv`; rows are read, and what is wrong with them is found, one by one."""
@@ -651,10 +654,14 @@ def stream_csv(
     names = [name.strip() for name in next(lines, (1, []))[1]]
     missing = [name for name in required if name not in names]
     twice = [name for name in names if name and names.count(name) > 1]
+    if not names:
+        raise fault(f"{path}: is empty")
     if missing:
         raise fault(f"{path}: column {missing[0]} is missing; it has {as_line(', '.join(names))}")
     if twice:
         raise fault(f"{path}: column {as_line(twice[0])} occurs twice")
+    if known and (lost := [name for name in names if name and name not in known]):
+        warn(f"{path}: not read: columns {as_line(', '.join(lost))}")
 
     def rows() -> Iterator[tuple[int, dict[str, str]]]:
         for line, cells in lines:

@@ -1,7 +1,7 @@
 """Poses of the body over time: the true track of a simulation, the navigation log of a dive."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -63,8 +63,10 @@ def read_track(path: Path) -> Trajectory:
     return Trajectory(time_s=time_s, ned_from_body=poses)
 
 
-def read_columns(path: Path, required: Sequence[str]) -> dict[str, Array]:
-    """Read the required columns of a CSV file as finite numbers.
+def read_columns(
+    path: Path, required: Sequence[str], known: Collection[str] = ()
+) -> dict[str, Array]:
+    """Read the required columns of a CSV file as finite numbers; `known` as of `read_csv`.
 
     Raises:
         NavigationError: the file is missing, lacks a column, or holds a value that is not a finite
@@ -72,7 +74,7 @@ def read_columns(path: Path, required: Sequence[str]) -> dict[str, Array]:
     """
     table = [
         [_number(path, line, row, name) for name in required]
-        for line, row in read_csv(path, required)[1]
+        for line, row in read_csv(path, required, known=known)[1]
     ]
     values = np.asarray(table, dtype=np.float64).reshape(-1, len(required))
     return {name: values[:, i] for i, name in enumerate(required)}

@@ -156,6 +156,8 @@ def _read_corners(path: Path) -> _Layer:
         if any(map(is_unknown, corner)) or (crs is not None and is_nowhere(*corner)):
             raise PlanError(f"area: {path} line {line}: {corner} stands for an unknown place")
         ring.append(corner)
+    if not ring:
+        raise PlanError(f"area: {path}: holds no corner")
     _refuse_corners(path.name, len(ring))
     return _Layer(name="", shapes=from_rings(path.name, [ring], geographic=False), crs=crs)
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.core.artefacts import read_csv
-from alice_survey.core.contents import as_line, parse_number
+from alice_survey.core.contents import as_line, is_unknown, parse_number
 from alice_survey.core.errors import NavigationError, warn
 from alice_survey.core.frames import Array, rotation_from_attitude
 from alice_survey.core.trajectory import read_track
@@ -28,6 +28,7 @@ from missions.logs.navigation_csv import (
     read_navigation,
     utc_date,
 )
+from missions.values.navigation import TRIGGER_LOG
 from missions.values.plan_file import Plan
 
 _ALIKE_RAD = math.radians(45.0)
@@ -177,7 +178,7 @@ def read_triggers(path: Path, nav: NavigationLog) -> Triggers:
     Raises:
         NavigationError: it cannot be read, or a time is none or does not follow the one before.
     """
-    names, rows = read_csv(path)
+    names, rows = read_csv(path, known=TRIGGER_LOG)
     dated = "time_s" not in names
     if dated and "time_utc" not in names:
         raise NavigationError(
@@ -211,7 +212,7 @@ def read_triggers(path: Path, nav: NavigationLog) -> Triggers:
 
 def _line_number(cell: str) -> int:
     number = int(cell)
-    if abs(number) > _MAX_TRIGGERS:
+    if abs(number) > _MAX_TRIGGERS or is_unknown(number):
         raise ValueError(f"line is {cell:.60}")
     return number
 

@@ -416,7 +416,8 @@ def read_tide(text: str, *, dated: bool) -> float | Signal:
             return metres
     column = "time_utc" if dated else "time_s"
     try:
-        rows = read_csv(Path(text), (column, "height_m"))[1]
+        known = ("time_s", "time_utc", "height_m")
+        rows = read_csv(Path(text), (column, "height_m"), known=known)[1]
     except NavigationError as error:
         undated = "" if dated else " (the log's times have no date)"
         raise NavigationError(

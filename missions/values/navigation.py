@@ -16,6 +16,8 @@ COLUMNS = (
     "sigma_altitude_m",
 )  # fmt: skip
 """Columns of a navigation CSV, after the time."""
+TRIGGER_LOG = ("time_s", "time_utc", "image", "number", "camera", "station", "line")
+"""Columns of tables that say when pictures were taken."""
 _DECIMALS = (10, 10, 5, 6, 6, 6, 5, 6, 6, 6, 6, 6)
 """Decimals of `COLUMNS`; positions to 0.01 mm."""
 

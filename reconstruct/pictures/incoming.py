@@ -39,6 +39,7 @@ from missions.logs.navigation_csv import (
     warn_of_gaps,
 )
 from missions.logs.ros_bag import opened_bag
+from missions.values.navigation import TRIGGER_LOG
 from reconstruct.pictures import files
 from reconstruct.pictures.undistorted import read_mask
 
@@ -229,7 +230,7 @@ def _trigger_times(
     triggers: Path, sides: Mapping[str, Sequence[Path]], zone: tzinfo
 ) -> dict[Path, float]:
     """Times of the pictures that a trigger log holds; the others are named in a warning."""
-    columns, rows = read_csv(triggers, exact=True, fault=ImageError)
+    columns, rows = read_csv(triggers, exact=True, known=TRIGGER_LOG, fault=ImageError)
     when = next((name for name in ("time_s", "time_utc") if name in columns), None)
     which = next((name for name in ("image", "number") if name in columns), None)
     if when is None or which is None:

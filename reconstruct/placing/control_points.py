@@ -165,7 +165,7 @@ def read_control(path: Path) -> Control:
         WorkspaceError: it cannot be read, or a row is wrong; the message names the line.
     """
     points, lengths = [], []
-    for row, fault in _rows(path, ("kind", "name", "use")):
+    for row, fault in _rows(path, ("kind", "name", "use"), _KNOWN_COLUMNS):
         with fault:
             known = _read_known(row)
         if isinstance(known, KnownPoint):
@@ -186,7 +186,7 @@ def read_picks(path: Path) -> list[Pick]:
         WorkspaceError: it cannot be read, or a row is wrong.
     """
     picks = []
-    for row, fault in _rows(path, ("image", "point", "x", "y")):
+    for row, fault in _rows(path, ("image", "point", "x", "y"), PICKS_HEADER):
         if not row["x"] and not row["y"]:
             continue
         with fault:
@@ -207,10 +207,10 @@ def read_picks(path: Path) -> list[Pick]:
 
 
 def _rows(
-    path: Path, required: Sequence[str]
+    path: Path, required: Sequence[str], known: Sequence[str]
 ) -> Iterator[tuple[dict[str, str], AbstractContextManager[None]]]:
     """Rows that are not comments, each with a context in which a fault names its line."""
-    for line, row in read_csv(path, required, fault=WorkspaceError)[1]:
+    for line, row in read_csv(path, required, known=known, fault=WorkspaceError)[1]:
         if not next(iter(row.values()), "").startswith("# "):
             yield row, _fault_of(f"{path} line {line}")
 
@@ -251,11 +251,11 @@ _POINT_COLUMNS = (
     "latitude_deg", "longitude_deg", "north_m", "east_m", "depth_m", "height_m", "sigma_m",
     "sigma_vertical_m",
 )  # fmt: skip
+_KNOWN_COLUMNS = ("kind", "name", "use", *_POINT_COLUMNS, "from", "to", "length_m")
 
 
 def write_control(path: Path, points: Sequence[KnownPoint], lengths: Sequence[KnownLength]) -> None:
     """Write a new `control.csv` of points and bars."""
-    header = ("kind", "name", "use", *_POINT_COLUMNS, "from", "to", "length_m")
     rows: list[Sequence[object]] = [
         ("point", p.name, p.use, *(getattr(p, name) for name in _POINT_COLUMNS), *[None] * 3)
         for p in points
@@ -264,7 +264,7 @@ def write_control(path: Path, points: Sequence[KnownPoint], lengths: Sequence[Kn
         ("bar", b.name, b.use, *[None] * 6, b.sigma_m, None, *(b.ends or ()), b.length_m)
         for b in lengths
     ]
-    write_csv(path, header, rows)
+    write_csv(path, _KNOWN_COLUMNS, rows)
 
 
 def write_picks(path: Path, picks: Sequence[Pick]) -> None:

@@ -121,10 +121,21 @@ def _ascii_grid() -> str:
 
 _GPKG, _SIDES = partial(_by_gdal, driver="GPKG"), (".shx", ".dbf", ".prj")
 _BY_SHP, _PREFIXED = partial(read_area, ending=".shp"), partial(read_depths, crs="EPSG:4326")
+_PLACES = list(_DEGREES.exterior.coords)[:-1]
+_CORNERS = "name,lat,lon\n" + "".join(f"c{i},{y},{x}\n" for i, (x, y) in enumerate(_PLACES))
+_POLY = "#saved by Mission Planner\n" + "".join(f"{y} {x}\n" for x, y in _PLACES)
+_GPX = (
+    '<?xml version="1.0"?><gpx version="1.1" xmlns="http://www.topografix.com/GPX/1/1"><rte>'
+    + "".join(f'<rtept lat="{y}" lon="{x}"/>' for x, y in _PLACES)
+    + "</rte></gpx>"
+)
 TARGETS = (
     Target("GeoJSON", "json", "a.geojson", geojson(), read_area),
     Target("GeoJSON zones", "json", "z.json", geojson(), read_zones),
     Target("KML", "text", "a.kml", kml(), read_area),
+    Target("corners CSV", "csv", "corners.csv", _CORNERS, read_area),
+    Target("GPX", "text", "a.gpx", _GPX, read_area),
+    Target("corners of Mission Planner", "text", "a.poly", _POLY, read_area),
     Target("KMZ", "binary", "a.kmz", _kmz, read_area),
     Target("WKT", "text", "a.wkt", f"SRID=4326;{_DEGREES.wkt}", read_area),
     Target("GeoPackage", "binary", "a.gpkg", _GPKG, read_area),

@@ -364,10 +364,12 @@ def read_foreign_log(path: Path, columns: ColumnMap) -> VehicleLog:
         VehicleError: a column is missing, or what `read_vehicle_log` raises.
     """
     table = read_number_columns(path)
+    unread = dict.fromkeys(table)
 
     def one(name: str) -> Array:
         if name not in table:
             raise VehicleError(f"{path}: column {as_line(name)} is missing")
+        unread.pop(name, None)
         return table[name]
 
     if columns.time is not None:
@@ -407,6 +409,8 @@ def read_foreign_log(path: Path, columns: ColumnMap) -> VehicleLog:
         pulses = one(column.removeprefix("-"))
         pulses = 2.0 * _NEUTRAL_US - pulses if column.startswith("-") else pulses
         named[f"thrust_{name}_n"] = _thrust(pulses, columns, f"{path}: column {as_line(column)}")
+    if unread:
+        warn(f"{path}: not read: columns {as_line(', '.join(unread))}")
     return log_of_columns(named, str(path))
 
 

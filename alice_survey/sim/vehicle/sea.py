@@ -89,7 +89,7 @@ def read_current(path: Path) -> Current:
         NavigationError: the file is missing, lacks a column or holds a value that is not a number.
         VehicleError: a depth is missing at a time, or is there twice.
     """
-    columns = read_columns(path, _COLUMNS)
+    columns = read_columns(path, _COLUMNS, known=_COLUMNS)
     if not len(columns["time_s"]):
         raise VehicleError(f"{path}: has no rows")
     times, row = np.unique(columns["time_s"], return_inverse=True)

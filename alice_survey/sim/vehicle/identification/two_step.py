@@ -32,6 +32,7 @@ from scipy.spatial.transform import Rotation
 
 from alice_survey.core.artefacts import read_csv
 from alice_survey.core.config import Config
+from alice_survey.core.contents import is_unknown
 from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
 from alice_survey.core.run.progress import step as named_step
@@ -58,6 +59,8 @@ class Pull(Config):
 
     @model_validator(mode="after")
     def _check_signs(self) -> Self:
+        if is_unknown(self.rpm) or is_unknown(self.force_n):
+            raise ValueError(f"{self.rpm:g} rpm, {self.force_n:g} N: one stands for unknown")
         if self.rpm == 0 or self.rpm * self.force_n < 0:
             raise ValueError(
                 f"{self.force_n:g} N at {self.rpm:g} rpm: force and speed must have one sign"
@@ -92,9 +95,10 @@ def read_pulls(path: Path) -> list[Pull]:
         VehicleError: the file cannot be read, lacks a column, has no rows, or holds a value that is
             not a number, or a force against its speed.
     """
-    _, rows = read_csv(path, Pull.model_fields, fault=VehicleError)
+    own = Pull.model_fields
+    _, rows = read_csv(path, own, known=own, fault=VehicleError)
     pulls = [
-        parse_table(f"{path} line {line}", Pull, {name: row[name] for name in Pull.model_fields})
+        parse_table(f"{path} line {line}", Pull, {name: row[name] for name in own})
         for line, row in rows
     ]
     if not pulls:
