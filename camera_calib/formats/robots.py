@@ -311,11 +311,11 @@ def read_zed(path: Path, reading: rigs.ReadOptions) -> Rig:
         lens = FisheyeLens if "k4" in values and "p1" not in values else OpenCVLens
         prefix = f"{side}_CAM_{end}."
         cameras.append(opencv_model.camera_of_terms(path, prefix, values, sizes[end], lens))
-    names = ("baseline", "ty", "tz", f"rx_{end}", f"cv_{end}", f"rz_{end}")
-    stereo = parts.pop("STEREO", {})
-    numbers = fields.read_vector((6,), [stereo.get(name.lower(), 0.0) for name in names])
-    other = [key for key in stereo if key not in names and "_" not in key]
-    fields.name_unread(path, [*other, *(name for name in parts if "_CAM_" not in name)])
+    turns = {size: [f"{axis}_{size.lower()}" for axis in ("rx", "cv", "rz")] for size in _ZED_SIZES}
+    model = fields.numbers_model(("baseline",), ("ty", "tz", *turns[end]))
+    found = model.check(path, parts.pop("STEREO", {}), "STEREO.", set[str]().union(*turns.values()))
+    numbers = np.array([*found.model_dump().values()])
+    fields.name_unread(path, (name for name in parts if "_CAM_" not in name))
     shift, turn = numbers[:3] * [-1e-3, 1e-3, 1e-3], Rotation.from_rotvec(numbers[3:])
     pose = RigidTransform.from_components(shift, turn)
     return rigs.assemble(path, reading, "ZED", ["left", "right"], cameras, [*rigs.ONE, pose])

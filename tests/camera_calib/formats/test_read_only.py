@@ -17,7 +17,7 @@ from camera_calib.formats.convert import FORMATS, Conversion, convert, detect
 from camera_calib.formats.rigs import ReadOptions
 from camera_calib.rig import Rig
 from tests.camera_calib.formats.test_metashape import manual_pixels
-from tests.strategies_formats import DATA
+from tests.strategies_formats import DATA, fault_of
 
 K = np.array([[530.0, 0.0, 311.5], [0.0, 531.0, 244.25], [0.0, 0.0, 1.0]])
 FOUR = (-0.1, 0.02, 1e-3, -2e-3)
@@ -169,6 +169,23 @@ def test_a_missing_size_is_asked_for(
         read(path)
     cameras = read(path, image_size=size).cameras.values()
     assert {(camera.width_px, camera.height_px) for camera in cameras} == {size}
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "named"),
+    [("SN1.conf", "TY=4.0", "TY=x", "ty"), ("SN1.conf", "Baseline=120.0", "", "baseline"),
+     ("orbslam_mono.yaml", "Camera.cx: 311.5", "", "cx"), ("kalibr_ds.yaml", "-0.2, ", "", "5; 6")],
+)  # fmt: skip
+def test_faults_name_file_and_key(
+    name: str, old: str, new: str, named: str, tmp_path: Path
+) -> None:
+    path = tmp_path / name
+    path.write_text((DATA / name).read_text().replace(old, new))
+    assert named in fault_of(read_vga, path)
+
+
+def read_vga(path: Path, _: ReadOptions) -> Rig:
+    return read(path, image_size=(672, 376))
 
 
 def test_further_keys_of_pairs_and_of_other_files_are_named(
