@@ -35,9 +35,11 @@ n_glass = 1.49
 BOARD = "chessboard 11x8 40mm"
 
 
-def surveyed(workspace: Path, camera: str, length_m: float, width_m: float) -> dict[str, Any]:
+def surveyed(
+    workspace: Path, camera: str, length_m: float, width_m: float, scale: int
+) -> dict[str, Any]:
     workspace.mkdir()
-    settings = demo_like(length_m, width_m)
+    settings = demo_like(length_m, width_m, scale)
     (workspace / "survey.toml").write_text(f"{settings}\n[camera]\n{camera}{GLASS}")
     command = [sys.executable, "-m", "alice_survey", "run", "-w", str(workspace), "--quiet"]
     subprocess.run(command, check=True, capture_output=True)
@@ -79,7 +81,7 @@ def pool_as(workspace: Path, output: Path, port: str | None, **more: Any) -> lis
 
 def test_a_dome_off_its_centre_is_surveyed_and_no_other_port_passes_for_it(tmp_path: Path) -> None:
     workspace = tmp_path / "dome"
-    check(surveyed(workspace, DOME, 2.6, 2.2), 2.6, 2.2)
+    check(surveyed(workspace, DOME, 2.6, 2.2, scale=4), 2.6, 2.2)
     assert not pool_as(workspace, tmp_path / "air", None)
     start = {"start": tmp_path / "air" / "rig.json"}
     dome = {"dome_radius_mm": "80", **start}
@@ -93,4 +95,4 @@ def test_a_dome_off_its_centre_is_surveyed_and_no_other_port_passes_for_it(tmp_p
 
 
 def test_a_fisheye_of_120_degrees_is_surveyed(tmp_path: Path) -> None:
-    check(surveyed(tmp_path / "fisheye", FISHEYE, 4.5, 3.7), 4.5, 3.7)
+    check(surveyed(tmp_path / "fisheye", FISHEYE, 3.6, 3.2, scale=6), 3.6, 3.2)

@@ -124,8 +124,9 @@ def _logs(folder: Path, made: Made) -> None:
 
 
 def _few_features(folder: Path) -> None:
-    """Settings for small pictures; a reader's are larger, and need none."""
-    (folder / "survey.toml").write_text("[reconstruct]\nmax_features = 600\n")
+    """Settings for small pictures, in which nothing moves; a reader's need none."""
+    settings = "[reconstruct]\nmax_features = 600\nmask_moving = false\n"
+    (folder / "survey.toml").write_text(settings)
 
 
 def _stereo(folder: Path, made: Made) -> None:
