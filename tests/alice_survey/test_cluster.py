@@ -11,7 +11,6 @@ from contextvars import copy_context
 from pathlib import Path
 
 import numpy as np
-import psutil
 import pytest
 
 from alice_survey.core.cluster import engine
@@ -20,7 +19,7 @@ from alice_survey.core.cluster.shared_values import LARGE_BYTES, pack, pack_once
 from alice_survey.core.cluster.worker import code_and_versions
 from alice_survey.core.errors import AliceError, ConfigError, WorkspaceError, keep_warnings
 from alice_survey.core.executor import SERIAL, Executor
-from alice_survey.core.run.resources import Meter
+from alice_survey.core.run.resources import Meter, cpu_s, family
 from tests import dask_tasks
 from tests.dask_machines import Machines, kill, kill_work
 from tests.small_survey import settings_in
@@ -151,13 +150,6 @@ def test_what_a_killed_run_left_goes_and_what_another_uses_stays(tmp_path: Path)
             run.communicate()
 
 
-def spent_s() -> float:
-    """Processor's time of this process and those below it, what a cluster itself needs included."""
-    here = psutil.Process()
-    times = [one.cpu_times() for one in (here, *here.children(recursive=True))]
-    return float(sum(one.user + one.system for one in times))
-
-
 @pytest.mark.slow
 def test_computing_of_workers_below_this_process_counts_once(tmp_path: Path) -> None:
     file = tmp_path / "local.toml"
@@ -166,9 +158,9 @@ def test_computing_of_workers_below_this_process_counts_once(tmp_path: Path) -> 
     )
     with cluster_executor(tmp_path, None, file) as executor:
         list(executor.map(dask_tasks.compute, [0.0], label="load"))
-        before_s, meter = spent_s(), Meter()
+        before_s, meter = sum(map(cpu_s, family())), Meter()
         list(executor.map(dask_tasks.compute, [1.0] * 4, label="compute"))
-        assert 3.9 < meter.look()["cpu_s"] < spent_s() - before_s + 1.0
+        assert 3.9 < meter.look()["cpu_s"] < sum(map(cpu_s, family())) - before_s + 1.0
 
 
 @pytest.mark.slow
