@@ -144,7 +144,7 @@ def test_killed_again_and_again_it_ends_the_same(tiny_survey: Path, tmp_path: Pa
     assert not different
 
 
-LITTLE_MEMORY = 700 << 20
+LITTLE_MEMORY = 550 << 20
 """Bytes of data that are enough to start, and too few to reconstruct with."""
 
 
