@@ -84,7 +84,7 @@ def test_sigmas_are_honest_over_many_logs() -> None:
     assert np.max(damping) < 0.05
     assert np.max(drift) < 0.01
     squares = np.square(scores).sum(axis=0)
-    low, high = chi2.ppf([2e-4, 1.0 - 2e-4], len(scores))
+    low, high = (chi2.ppf(share, len(scores)) for share in (2e-4, 1.0 - 2e-4))
     assert np.all((squares > low) & (squares < high))
     assert 0.75 < np.sqrt(np.mean(np.square(scores))) < 1.3
 
