@@ -6,7 +6,6 @@ Nothing here imports the modules that do the work: they are named, and loaded wh
 from pathlib import Path
 
 from alice_survey.core.artefacts import read_json
-from alice_survey.core.frames import Datum
 from alice_survey.core.manifest import read_manifest
 from alice_survey.core.records import BoardRecord, FlightRecord
 from alice_survey.core.stages import WHOLE, StageSpec, Summary, only, without
@@ -14,6 +13,8 @@ from alice_survey.kit.words import count, share
 
 
 def _plan_summary(folder: Path) -> Summary:
+    from alice_survey.core.frames import Datum
+
     plan = read_json(folder / "plan.json")
     lines, dives = count(len(plan["lines"]), "line"), count(len(plan["dives"]), "dive")
     text = (
@@ -44,7 +45,7 @@ def _fly_summary(folder: Path) -> Summary:
         f"{_metres(line.cross_track_rms_m)} cross-track rms (the control's part "
         f"{_metres(line.believed_cross_track_rms_m)}), heading {_degrees(line.heading_rms_deg)} "
         f"rms; roll in turns to {_degrees(flight.in_turns.roll_worst_deg)}; "
-        f"{flight.min_clearance_m:.2f} m above the sea floor at least; "
+        f"{_metres(flight.min_clearance_m)} above the sea floor at least; "
         f"{sum(flight.energy_wh.values()):.1f} Wh; "
         f"{share(flight.coverage.share_at_overlap)} of the area covered as requested{promised}, "
         f"{share(flight.coverage.every_camera_share)} seen by every camera; "
@@ -61,9 +62,11 @@ def _fly_shortfall(folder: Path) -> str:
     flight = FlightRecord.read(folder / "flight.json")
     if flight.ending != "complete":
         return f"the flight ended early: {flight.ending}"
-    worst_m, allowed_m = flight.outside_allowed.worst_m, flight.allowed_cross_track_m
-    if worst_m > allowed_m:
-        return f"{flight.vehicle} left the allowed area by {worst_m:.2f} m"
+    outside, allowed_m = flight.outside_allowed, flight.allowed_cross_track_m
+    if outside is None or allowed_m is None:  # of a version that did not look
+        return ""
+    if outside.worst_m > allowed_m:
+        return f"{flight.vehicle} left the allowed area by {outside.worst_m:.2f} m"
     planned = flight.stations_planned
     missed = max(planned - flight.stations, 0) + flight.stations_off_line
     if missed > _MAX_MISSED_SHARE * planned:
@@ -134,9 +137,6 @@ PLAN = StageSpec(
 )
 
 
-_FLOOR = only("area", "seafloor_depth_m", "bathymetry_values", "crs")
-"""Of the area, what the simulated sea floor is made of, besides the file of a bathymetry."""
-
 FLY = StageSpec(
     name="fly",
     folder="flight",
@@ -162,7 +162,7 @@ FLY = StageSpec(
         "sea": without("sea", "current_file"),
         "navigation": "navigation",
         "seafloor": "seafloor",
-        "floor": _FLOOR,
+        "seafloor_depth_m": "area.seafloor_depth_m",
         "plan": "plan",
         "position_body_m": "camera.position_body_m",
         "dvl_position_body_m": "camera.dvl_position_body_m",
@@ -229,7 +229,7 @@ IMAGE = StageSpec(
     needs=("plan", "fly"),
     settings={
         "seed": "seed",
-        "floor": _FLOOR,
+        "seafloor_depth_m": "area.seafloor_depth_m",
         "margins": only("plan", "altitude_m", "run_in_m", "turn_radius_m", "margin_m"),
         "camera": "camera",
         "water": without("water", "n_water_sigma"),

@@ -95,11 +95,11 @@ class FlightRecord(JsonRecord):
     duration_s: float
     stations: int
     stations_planned: int
-    stations_off_line: int
-    allowed_cross_track_m: float
-    min_clearance_m: float
+    stations_off_line: int = 0
+    allowed_cross_track_m: float | None = None
+    min_clearance_m: float | None = None
     """Of hull, port and DVL above the sea floor."""
-    outside_allowed: OutsideAllowed
+    outside_allowed: OutsideAllowed | None = None
     on_lines: OnLines
     in_turns: InTurns
     navigation_error_rms_m: float | None

@@ -196,7 +196,9 @@ def _flight_figure(flight: Flight) -> Any:
         for edge in time_s[np.flatnonzero(np.diff(following))]:
             axes.axvline(edge, color=SOFT, lw=0.7, ls="--", zorder=1)
     altitude_m = flight.plan.altitude_m
-    strips[3].set_ylim(altitude_m - 0.5, altitude_m + 0.5)
+    flown = flight.log.altitude_m[(flight.line >= 0) & np.isfinite(flight.log.altitude_m)]
+    top_m = max(altitude_m + 0.5, float(flown.max(initial=0.0)))
+    strips[3].set_ylim(altitude_m - 0.5, top_m)
     for axes, name in zip(strips[4:6], ("north", "east"), strict=True):
         band = _SIGMAS * _column(flight.flown, f"sigma_{name}_m")[some]
         axes.fill_between(

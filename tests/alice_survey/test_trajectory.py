@@ -79,7 +79,7 @@ def test_columns_may_come_in_any_order_and_company(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "named"),
     [
-        ("a\n1\n", "column b"), ("", "column a"), ("a,b\n1,2\n3,nan\n", "line 3: b is 'nan'"),
+        ("a\n1\n", "column b"), ("", "empty"), ("a,b\n1,2\n3,nan\n", "line 3: b is 'nan'"),
         ("a,b\n1,inf\n", "line 2: b is 'inf'"), ("a,b\n1,\n", "line 2: b is ''"),
         ("a,b\n1\n", "line 2: b is ''"), ("a,b\nten,1\n", "line 2: a is 'ten'"),
     ],

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 from scipy.stats import chi2
 
 from alice_survey.core.config import (
@@ -17,6 +16,7 @@ from alice_survey.core.config import (
     WaterConfig,
 )
 from alice_survey.core.errors import VehicleError
+from alice_survey.kit import figure
 from alice_survey.sim.vehicle.navigation.tick import LOG_COLUMNS
 from alice_survey.sim.vehicle.pilot.command import ThrustWatch
 from alice_survey.sim.vehicle.sea import FloorGrid, current_at
@@ -139,7 +139,7 @@ def test_strips_show_errors_thrusters_and_power(
     flight: Flight, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     kept: list[Any] = []
-    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: kept.append(figure))
+    monkeypatch.setattr(figure, "save_figure", lambda sheet, *_, **__: kept.append(sheet))
     draw_flight(tmp_path / "drawn.png", flight)
     curves = {
         (axes.get_ylabel(), line.get_label()): np.asarray(line.get_ydata(), np.float64)

@@ -344,8 +344,8 @@ def _add_specks(
         if cell_m < 3.0 * finest:
             continue
         near_specks(x, y, z, cell_m, share, apart, key, near)
-        for i in np.flatnonzero(near):
-            if cell_m < 3.0 * apart[i]:
+        for i in range(len(x)):
+            if not near[i] or cell_m < 3.0 * apart[i]:
                 continue
             cover, back, gloom, own = speck(
                 x[i], y[i], z[i], cell_m, share, apart[i], 0.2 * abs(fine[i]), key

@@ -80,7 +80,7 @@ def test_a_trigger_log_pairs_and_times(tmp_path: Path) -> None:
     log = table(tmp_path / "triggers.csv", "camera,image,time_utc", rows[:-1])
     with keep_warnings() as said:
         import_images(tmp_path / "w", [], cameras={s: tmp_path / s for s in sides}, triggers=log)
-    assert any("are not in" in text and sides["right"][-1].name in text for text in said)
+    assert any("triggers.csv" in text and sides["right"][-1].name in text for text in said)
     records = rows_of(tmp_path / "w")
     del expected[-1]["right"]
     assert {(r.image, r.station) for r in records} == {

@@ -31,7 +31,7 @@ def test_folders_are_listed_with_what_they_hold(home: Path) -> None:
     assert top.inside[0].folders == 1
     dive = folders.list_folder(str(home / "dive"), typed=False)
     assert [one.name for one in dive.inside] == ["left"] and dive.above == str(home)
-    assert [Path(path).name for path in dive.files] == ["nav.csv", "rig.json"]
+    assert [Path(path).name for path in dive.files] == ["nav.csv", "notes.txt", "rig.json"]
 
 
 def test_what_lies_outside_is_listed_only_where_it_was_typed(home: Path) -> None:
