@@ -264,18 +264,18 @@ def check_raster(path: Path) -> None:
         )
 
 
-_SHALLOW_M, _SOME = 0.5, 0.01
-"""Least distance of values from zero, and share of zeros, for which zero stands for unknown."""
+_SHALLOW_M = 0.5
+"""Zero stands for unknown where no other value is nearer to it."""
 
 
 def _without_unknown(path: Path, band: Any) -> Any:
     """Values of a raster without those that stand for "not known", which it need not declare.
 
-    Zero is one where it is in a hundredth of the cells and the others are far from it.
+    Zero is one where all others are far from it.
     """
     zero = band == 0
     far = np.ma.abs(band[~zero]) > _SHALLOW_M
-    is_zero_unknown = bool(zero.mean() > _SOME and far.size and far.all())
+    is_zero_unknown = bool(zero.any() and far.size and far.all())
     unknown = [value for value in UNKNOWN if (band == value).any()] + [0.0] * is_zero_unknown
     if unknown:
         names = " and ".join(f"{value:g}" for value in unknown)
