@@ -11,8 +11,8 @@ from scipy.spatial.transform import RigidTransform
 
 from alice_survey.core.artefacts import check_type, read_json, write_json
 from alice_survey.core.config import CameraConfig, WaterConfig
-from alice_survey.core.contents import one_line
-from alice_survey.core.errors import CalibrationError
+from alice_survey.core.contents import as_line, one_line
+from alice_survey.core.errors import CalibrationError, warn
 from alice_survey.core.frames import BODY_FROM_NADIR_CAM, Array, pose_from_json, pose_to_json
 from camera_calib.camera import Camera, camera_from_json
 from camera_calib.optics import LENSES, PORTS
@@ -273,6 +273,8 @@ def read_rig(path: str | Path) -> Rig:
                 f"{_FORMAT['version']}: calibrate again, or change the file by docs/formats.md"
             )
         file = check_type(_RigFile, data)
+        if lost := data.keys() - _FORMAT.keys() - _RigFile.model_fields.keys():
+            warn(f"{path}: not read: {as_line(', '.join(sorted(lost)))}")
         return Rig(
             cameras={name: _camera(name, one) for name, one in file.cameras.items()},
             cam_from_rig={

@@ -2,6 +2,7 @@
 
 import csv
 import io
+import json
 import re
 from collections.abc import Callable
 from functools import partial
@@ -64,6 +65,44 @@ def test_short_tables_give_a_value_or_one_line(name: str, count: int, tmp_path: 
 @pytest.mark.parametrize("encoding", ["utf-16", "cp1252", "utf-8-sig"])
 def test_other_encodings_give_a_value_or_one_line(name: str, encoding: str, tmp_path: Path) -> None:
     tried(name, tmp_path, lambda rows: with_column(rows, "été", "1"), encoding)
+
+
+TEXTS = [name for name, target in TARGETS.items() if target.syntax != "binary"]
+
+
+@pytest.mark.parametrize("name", TEXTS)
+def test_empty_files_and_other_encodings_give_a_value_or_one_line(
+    name: str, tmp_path: Path
+) -> None:
+    trial = Trial(TARGETS[name], tmp_path)
+    text = trial.good.decode()
+    for data in (b"", b"\n", text.encode("utf-16"), f"{text}\n\xe9".encode("cp1252", "replace")):
+        verdict = trial.verdict(data)
+        assert verdict.outcome != "fault", f"{verdict.message}\n{verdict.trace}"
+
+
+OPEN = {
+    "GeoJSON": "RFC 7946 has foreign members", "GeoJSON zones": "the same",
+    "reports of a DVL": "lines of which each has keys of its own",
+}  # fmt: skip
+"""Files that may hold more than their reader knows, and why."""
+KEYED = [name for name in TEXTS if TARGETS[name].syntax in ("json", "toml") and name not in OPEN]
+
+
+@pytest.mark.parametrize("name", KEYED)
+def test_keys_that_are_not_read_are_named(name: str, tmp_path: Path) -> None:
+    trial = Trial(TARGETS[name], tmp_path)
+    text = trial.good.decode()
+    if TARGETS[name].syntax == "toml":
+        more = f"wibble_m = 7.25\n{text}"
+    else:
+        values = json.loads(text)
+        (values[0] if isinstance(values, list) else values)["wibble_m"] = 7.25
+        more = json.dumps(values)
+    with keep_warnings() as warnings:
+        verdict = trial.verdict(more.encode())
+    assert verdict.outcome != "fault", f"{verdict.message}\n{verdict.trace}"
+    assert "wibble_m" in "\n".join([verdict.message, *warnings])
 
 
 @pytest.mark.parametrize("unknown", ["-9999", "-32768", "nan"])
