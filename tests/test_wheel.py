@@ -83,7 +83,7 @@ def test_it_holds_what_the_packages_read(wheel: Path) -> None:
 
 
 def test_it_compiles_nothing_where_nobody_may_write_to_it(
-    wheel: Path, small_survey: Path, tmp_path: Path
+    wheel: Path, tiny_survey: Path, tmp_path: Path
 ) -> None:
     """As another user, who may read what root may; results are those of the clone to the byte."""
     installed, home, reef = (tmp_path / name for name in ("installed", "home", "home/reef"))
@@ -123,7 +123,7 @@ def test_it_compiles_nothing_where_nobody_may_write_to_it(
     compiled_by("studio", "--no-browser")  # which may end at once: what it has kept is counted
     assert found == dict.fromkeys(found, 0)
     assert not [*home.rglob("*.nbi"), *installed.rglob("__pycache__/*.nbi")]
-    assert results(reef) == results(small_survey)
+    assert results(reef) == results(tiny_survey)
 
 
 def test_every_import_is_a_base_dependency_or_of_an_extra(program: Path, tmp_path: Path) -> None:
