@@ -112,7 +112,7 @@ def test_nothing_is_computed_from_damaged_files(workspace: Path) -> None:
             with pytest.raises(WorkspaceError, match=path.name) as refusal:
                 run_stage(workspace, replace(stage, version=-1), lambda _: pytest.fail("worked"))
             owner = spec(path.relative_to(workspace).parts[0])
-            assert f"alice-survey {owner.command}'" in str(refusal.value)
+            assert f"alice-survey {owner.command} -w {workspace}'" in str(refusal.value)
             with pytest.raises(WorkspaceError, match=path.name):
                 owner.need(workspace)
             path.write_bytes(before)
@@ -166,10 +166,10 @@ def test_an_edited_mission_is_flown_only_on_request(workspace: Path) -> None:
     with pytest.raises(PlanError, match="--edited"):
         invoke(fly)
     code, said = invoke([*fly, "--edited"])
-    assert code == 0 and "complete" in said
+    assert code == 3 and "complete" in said  # COLA2 swings out of the area in its turns
     invoke(["plan", "export", str(workspace)])
     assert mission.read_text() == text
-    assert invoke(fly)[0] == 0
+    assert invoke(fly)[0] == 3
     assert "plan/         up to date" in invoke(["status", "-w", str(workspace)])[1]
 
 
