@@ -273,7 +273,8 @@ def read_rig(path: str | Path) -> Rig:
                 f"{_FORMAT['version']}: calibrate again, or change the file by docs/formats.md"
             )
         file = check_type(_RigFile, data)
-        if lost := data.keys() - _FORMAT.keys() - _RigFile.model_fields.keys():
+        # Sigmas are written for people: the covariance holds them.
+        if lost := data.keys() - {*_FORMAT, *_RigFile.model_fields, "sigmas"}:
             warn(f"{path}: not read: {as_line(', '.join(sorted(lost)))}")
         return Rig(
             cameras={name: _camera(name, one) for name, one in file.cameras.items()},

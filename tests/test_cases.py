@@ -51,8 +51,8 @@ def test_depths_that_stand_for_unknown(name: str) -> None:
 @pytest.mark.parametrize("masks", ["colmap", "upper", None])
 def test_masks(masks: str | None, tmp_path: Path) -> None:
     folder = CASES / "masks-named-by-others"
-    given = {} if masks is None else {"masks": folder / masks}
-    import_images(tmp_path, [folder / ("odm" if masks is None else "pics")], **given)
+    apart = None if masks is None else folder / masks
+    import_images(tmp_path, [folder / ("odm" if masks is None else "pics")], masks=apart)
     assert [bool(one.mask) for one in rows_of(tmp_path)] == [True, True]
 
 
