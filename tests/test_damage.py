@@ -121,7 +121,7 @@ def test_nothing_is_computed_from_damaged_files(workspace: Path) -> None:
 
 
 def test_two_threads_make_every_damaged_product_again(tiny_survey: Path, workspace: Path) -> None:
-    """All products of all stages are damaged at once; the same command makes each anew.
+    """All products of all stages are damaged at once; the same command makes each again.
 
     Two threads give the same numbers as one.
     """

@@ -14,7 +14,7 @@ from alice_survey.core.errors import PlanError
 from alice_survey.core.frames import Array
 from missions.areas.bathymetry import Bathymetry
 from missions.exports.geometry import CameraMount, chords, line_depths
-from missions.route.terrain import Reach, highest_floor
+from missions.route.terrain import Reach, highest_floor, with_depths_between
 from missions.values.costs import SETTLE_S
 from missions.values.legs import Leg
 from missions.values.plan_file import Dive, Plan
@@ -257,14 +257,10 @@ def _with_depths(points: list[_Point], plan: Plan, line_depths: Sequence[Array])
             for point in points
         ]
     )
-    known = np.flatnonzero(np.isfinite(depths))
-    if not len(known):
+    if not np.isfinite(depths).any():
         level_m = plan.seafloor_depth_m - plan.altitude_m
         return [point._replace(glass_depth_m=level_m) for point in points]
-    place = np.arange(len(points))
-    after = depths[known[np.clip(np.searchsorted(known, place), 0, len(known) - 1)]]
-    before = depths[known[np.clip(np.searchsorted(known, place, "right") - 1, 0, len(known) - 1)]]
-    levels = np.minimum(before, after)
+    levels = with_depths_between(depths)
     return [p._replace(glass_depth_m=float(d)) for p, d in zip(points, levels, strict=True)]
 
 

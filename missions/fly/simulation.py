@@ -92,7 +92,7 @@ from missions.route.energy import (
     plan_as_flown,
     sound_vehicle,
 )
-from missions.route.terrain import envelope
+from missions.route.terrain import envelope, with_depths_between
 from missions.values.flight import Flight, trigger_times
 from missions.values.legs import Leg, Route
 from missions.values.line import Line
@@ -910,11 +910,7 @@ def _profile(
         )
         begins_m += leg.length_m
     along, depth = np.concatenate(at_m), np.concatenate(depth_m)
-    known = np.flatnonzero(np.isfinite(depth))
-    row = np.arange(len(depth))
-    after = depth[known[np.clip(np.searchsorted(known, row), 0, len(known) - 1)]]
-    before = depth[known[np.clip(np.searchsorted(known, row, "right") - 1, 0, len(known) - 1)]]
-    deepest = np.fmin(np.minimum(before, after), np.concatenate(limit_m))  # not known: as between
+    deepest = np.fmin(with_depths_between(depth), np.concatenate(limit_m))  # not known: as between
     profile = envelope(along, deepest, math.tan(steepest_rad))
     along, first = np.unique(along, return_index=True)
     return along, profile[first] - glass_down_m

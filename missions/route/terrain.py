@@ -255,6 +255,16 @@ def way_depths_m(
     return tuple(depths)
 
 
+def with_depths_between(depths_m: Array) -> Array:
+    """Depths, (N,), along a way; those that are NaN are the shallower of the nearest known ones."""
+    known, place = np.flatnonzero(np.isfinite(depths_m)), np.arange(len(depths_m))
+    last = len(known) - 1
+    after = depths_m[known[np.clip(np.searchsorted(known, place), 0, last)]]
+    before = depths_m[known[np.clip(np.searchsorted(known, place, "right") - 1, 0, last)]]
+    levels: Array = np.minimum(before, after)
+    return levels
+
+
 def terrain_figures(
     profiles: Sequence[DepthProfile], limits: TerrainLimits, relief_m: float
 ) -> dict[str, Any]:
