@@ -250,11 +250,13 @@ def init_survey(
         text = with_settings_changed(text, values)
     config = parse_config(settings_in(text, "the new survey"), "the new survey")
     if area is not None:
-        from missions.areas.survey import survey_area
+        from missions.areas.survey import given_shapes, survey_area
 
         shapes = config.area.model_copy(update={"file": area})
         found = survey_area(shapes, turn_margin_m=3.0)
-        say(f"area: {found.datum.place}, {digits(found.survey.area)} m2")
+        strips = f" in strips of {shapes.corridor_width_m:g} m along lines (area.corridor_width_m)"
+        along = strips if given_shapes(shapes).survey.lines else ""
+        say(f"area: {found.datum.place}, {digits(found.survey.area)} m2{along}")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         path.write_text(text, encoding="utf-8")

@@ -687,16 +687,22 @@ def _cells(path: Path, *, exact: bool, fault: type[AliceError]) -> Iterator[tupl
         with ordinary_file(path).open("rb") as raw:
             encoding = "utf-8-sig" if exact else _encoding_of(raw.read(_LOOKED_AT))
         with path.open(newline="", encoding=encoding) as file:
-            first = file.readline()
+            start, first, skipped = 0, file.readline(), 0
+            while first.startswith("#"):  # comments, and a header may begin with "#"
+                at, after = file.tell(), file.readline()
+                if not after.startswith("#"):
+                    break
+                warn(f"{path}: not read: {as_line(first.strip())}")
+                start, first, skipped = at, after, skipped + 1
             named = re.fullmatch(r"sep=(.)\s*", first, re.IGNORECASE)
             found = [mark for mark in ";\t" if mark in first and "," not in first]
             separator = named[1] if named else (*found, ",")[0]
-            file.seek(0)
+            file.seek(start)
             reader = csv.reader(file, delimiter=separator, skipinitialspace=not exact)
             for cells in itertools.islice(reader, 1 if named else 0, None):
                 if separator != ",":
                     cells = [_DECIMAL_COMMA.sub(r"\1.\2", cell) for cell in cells]
-                yield reader.line_num, cells
+                yield skipped + reader.line_num, cells
 
 
 def _encoding_of(start: bytes) -> str:

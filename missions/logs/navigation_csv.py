@@ -37,13 +37,13 @@ _RANGES = {
 USUAL_NAMES: Mapping[str, str] = {
     "latitude_deg": "latitude lat y/latitude gps_latitude gpslatitude",
     "longitude_deg": "longitude lon long lng x/longitude gps_longitude gpslongitude",
-    "depth_m": "depth water_depth vehicle_depth sample_depth",
+    "depth_m": "depth dep water_depth vehicle_depth sample_depth",
     "heading_deg": "heading yaw hdg compass_heading",
     "roll_deg": "roll", "pitch_deg": "pitch",
     "altitude_m": "altitude alt height_above_bottom range_to_bottom dvl_altitude",
     "time_utc": "timestamp utc datetime date_time date/time time utc_time utc_t",
     "time_s": "unix_time epoch unixtime",
-    IMAGE: "label filename file_name file image_name image_filename picture photo key",
+    IMAGE: "label filename file_name file image_name image_filename picture photo key sourcefile",
     HEIGHT: "z/altitude",
     _DAY: "date utc_d", _SINCE: "sample_time",
 }  # fmt: skip
@@ -233,7 +233,7 @@ def bare_name(name: str) -> str:
     """A column's name without case, unit and marks; whole where the unit is another than ours."""
     if re.search(r"[(\[]\s*(ft|feet|fsw|[cmk]m|rad|ms)\b", name, re.IGNORECASE):
         return name.lower()
-    name = re.sub(r"[(\[].*", "", name).strip("# ").lower()
+    name = re.sub(r"[(\[].*|^(pose|gps|nav)\.", "", name.lower()).strip("# ")
     return re.sub(r"_(degrees|deg|m)$", "", re.sub(r"[\s-]+", "_", name))
 
 

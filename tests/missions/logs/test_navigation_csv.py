@@ -1,3 +1,4 @@
+import re
 from datetime import UTC, datetime
 from pathlib import Path
 from zoneinfo import ZoneInfo
@@ -146,6 +147,7 @@ def test_each_reading_has_gaps_of_its_own(tmp_path: Path) -> None:
 DATES = ["2024-07-06T10:00:00Z", "2024-07-06T10:00:05Z"]
 FOREIGN = {
     "usual names": (",", "time_utc,lat,Longitude (deg),Depth,yaw_deg,altitude", DATES),
+    "prefixes": (",", "timestamp,pose.lat,gps.lon,pose.dep,nav.heading,pose.alt", DATES),
     "decimal commas": (";", "Timestamp;LATITUDE;lon;depth [m];HDG;alt_m", DATES),
     "since 1970": ("\t", "time_s\tlat\tlon\tdepth\thdg\talt", ["1720260000", "1720260005"]),
 }  # fmt: skip
@@ -218,9 +220,12 @@ def test_what_stands_for_unknown_is_no_value(tmp_path: Path, cells: str) -> None
     assert known == {*header.split(",")[1:]} - lost
 
 
-def test_positions_by_the_names_of_pictures(tmp_path: Path) -> None:
+def test_positions_by_the_names_of_pictures(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """As Metashape exports them; a name with its folder comes before one without."""
-    header = "#Label,X/Longitude,Y/Latitude,Z/Altitude,Yaw"
+    header = '# CoordinateSystem: GEOGCS["WGS 84",\n# 3 cameras\n#'
+    header += "SourceFile,X/Longitude,Y/Latitude,Z/Altitude,Yaw"
     rows = ["IMG_2.JPG,5.5,60,-3,350", "dive2\\img_1.jpg,6,61,-4,10", "IMG_1,7,62,-5,-20"]
     log = read_navigation(log_file(tmp_path, *rows, header=header), UTC, (), by_picture=True)
     time_s, found = log.of_pictures(["a/dive1/IMG_1.png", "dive2/IMG_1.JPG", "img_2.jpg", "IMG_3"])
@@ -228,7 +233,8 @@ def test_positions_by_the_names_of_pictures(tmp_path: Path) -> None:
     np.testing.assert_allclose(found["latitude_deg"], [62, 61, 60, np.nan])
     np.testing.assert_allclose(found["depth_m"], [5, 4, 3, np.nan])
     np.testing.assert_allclose(found["heading_deg"], [340, 10, 350, np.nan])
-    with refused(NavigationError, "second row"):
+    assert {"GEOGCS", "cameras"} <= set(re.findall(r"\w+", capsys.readouterr().err))
+    with refused(NavigationError, "line 7: a second row"):
         rows = [*rows, "img_2.png,1,1,1,1"]
         read_navigation(log_file(tmp_path, *rows, header=header), UTC, (), by_picture=True)
 
