@@ -53,8 +53,8 @@ def check(score: dict[str, Any], length_m: float, width_m: float) -> None:
     pixel_mm = score["surface"]["ground_pixel_mm"]
     assert 0.01 < score["cameras"]["rms_mm"] / pixel_mm < 0.17
     assert 0.05 < score["surface"]["distance_rms_mm"] / pixel_mm < 0.28
-    # Most of a sigma is the calibration's, of which a survey has one draw: seeds give 0.5 to 1.5.
-    assert 0.3 < score["surface"]["error_over_sigma"]["robust"] < 2.0
+    # Most of a sigma is the calibration's, of which a survey has one draw: seeds give 0.5 to 1.7.
+    assert 0.3 < score["surface"]["error_over_sigma"]["robust"] < 2.5
     assert abs(score["cameras"]["scale_error_ppm"]) < 400
     north_m, east_m, _ = score["cameras"]["georeference_north_east_down_m"]
     missed = abs(north_m) / length_m + abs(east_m) / width_m  # strips at the edges, by navigation

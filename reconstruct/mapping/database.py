@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.core.frames import Array
@@ -42,6 +44,20 @@ class Observations:
             as_seen(rows, self.warps.get(record.camera))
             for record, rows in zip(self.images, self.taken, strict=True)
         ]
+
+    @cached_property
+    def connected(self) -> int:
+        """Pictures of the largest group that matches hold together, and the rig where it is known.
+
+        No mapper can register more in one model: pictures of blue water have no matches.
+        """
+        ends = [(i, j) for i, j, _ in self.pairs]
+        if self.warps:
+            first: dict[int, int] = {}
+            ends += [(first.setdefault(r.station, i), i) for i, r in enumerate(self.images)]
+        where = tuple(np.array(ends, dtype=np.intp).reshape(-1, 2).T)
+        graph = coo_array((np.ones(len(ends)), where), shape=(len(self.images),) * 2)
+        return int(np.bincount(connected_components(graph, directed=False)[1]).max())
 
 
 def new_folder(path: Path) -> Path:

@@ -50,7 +50,7 @@ _GROWTH = 1.4
 goes: 17.8 to 8.4 s on 24 stations, for the same rms. Where cameras calibrate themselves none to a
 quarter goes, for the same pictures and errors: 22.2 to 16.5, 5.3 to 4.3, 60.6 to 60.0 s."""
 _MAX_LOST = 0.02
-"""Share of pictures lost by the global mapper from which the incremental one is tried."""
+"""Share of connected pictures lost by the global mapper from which the incremental one is tried."""
 _MAX_REPROJECTION_PX = 2.0
 _MAX_SPREAD = 0.1
 """Radians, and lengths over the models' usual distance to the floor, by which shared stations may
@@ -126,7 +126,7 @@ def _map_rig(
     executor: Executor,
 ) -> tuple[list[pycolmap.Reconstruction], list[str]]:
     """Models, largest first, and how they came about."""
-    total = len(seen.images)
+    total = seen.connected
     one_station = len({record.station for record in seen.images}) == 1
     if len(seen.cameras) < 2 or one_station:
         why = "there is one station" if one_station else "one camera has no stereo pairs"
@@ -141,7 +141,7 @@ def _map_rig(
     note = (
         f"global mapping {' and '.join(faults)}: incremental mapping "
         f"{'was no better' if best is found else 'instead'}, "
-        f"with {pictures_in_largest(again)} of {total} pictures"
+        f"with {pictures_in_largest(again)} of {total} pictures that match"
     )
     warn(note)
     return best, [note]
@@ -160,7 +160,7 @@ def _globally(
         database = scratch / "database.db"
         found = _sort_by_size(map_globally(database, seen, cam_from_rig, options, seed, executor))
         if found and not unsound(found[0]):
-            grown = _grow(found[0], len(seen.images), scratch, options)
+            grown = _grow(found[0], seen.connected, scratch, options)
             if grown is not found[0]:
                 found = merge_models(_sort_by_size([grown, *found[1:]]), database, options)
     return _sort_by_size(found)
@@ -191,8 +191,8 @@ def map_from_poses(
     with scratch_database(folder / "mapper", seen, cam_from_rig) as scratch:
         poses = frame_poses(seen, rig_from_world)
         model = triangulate_and_adjust(scratch / "database.db", poses, options)
-        model = _grow(model, len(seen.images), scratch, options)
-        return _grow(model, len(seen.images), scratch, _lower_demands(options))
+        model = _grow(model, seen.connected, scratch, options)
+        return _grow(model, seen.connected, scratch, _lower_demands(options))
 
 
 def _grow(
@@ -202,7 +202,7 @@ def _grow(
     options: pycolmap.IncrementalPipelineOptions,
 ) -> pycolmap.Reconstruction:
     """A model to which pictures that it lacks are added one by one; itself where none can be."""
-    if model.num_reg_images() == total:
+    if model.num_reg_images() >= total:
         return model
     options.multiple_models = False
     grown = max(
@@ -224,7 +224,7 @@ def faults_of(found: Sequence[pycolmap.Reconstruction], total: int) -> list[str]
     faults = unsound(found[0])
     lost = total - found[0].num_reg_images()
     if lost > _MAX_LOST * total:
-        faults.append(f"left {lost} of {total} pictures out of its largest model")
+        faults.append(f"left {lost} of {total} pictures that match out of its largest model")
     return faults
 
 
@@ -291,7 +291,7 @@ def run_mapper(
     """
     options = _options(cam_from_rig, seed, free)
     found = _map_once(seen, cam_from_rig, folder, options, free)
-    if pictures_in_largest(found) == len(seen.images):
+    if pictures_in_largest(found) >= seen.connected:
         return found
     again = _map_once(seen, cam_from_rig, folder, _lower_demands(options), free)
     return max(found, again, key=pictures_in_largest)

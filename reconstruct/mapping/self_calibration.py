@@ -71,7 +71,7 @@ def map_self_calibrated(
     """
     known = set(exif_focal) == set(seen.cameras)
     found = run_mapper(seen, None, folder, seed, free="distortion" if known else "all")
-    if known and pictures_in_largest(found) < len(seen.images):
+    if known and pictures_in_largest(found) < seen.connected:
         freed = run_mapper(seen, None, folder, seed, free="all")
         if pictures_in_largest(freed) > pictures_in_largest(found):
             found, known = freed, False

@@ -78,6 +78,19 @@ def test_noise_of_a_third_of_a_pixel_costs_millimetres() -> None:
     assert abs(align_similarity(*pupils(mapped, scene)).scale - 1.0) < 2e-3
 
 
+def test_pictures_of_blue_water_ask_for_no_second_mapping(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two stations of ten match nothing, nor does one camera of a third."""
+    scene = make_scene(lines=2, stations=5, points=6000)
+    blank = [i for i, record in enumerate(scene.records) if record.station in (0, 9)]
+    blank.append(next(i for i, record in enumerate(scene.records) if record.station == 5))
+    pairs = [pair for pair in scene.pairs if not {*pair[:2]} & {*blank}]
+    for name in ("run_mapper", "_continue_mapping"):
+        monkeypatch.delattr(f"reconstruct.mapping.mapper.{name}")
+    mapped = mapped_scene(replace(scene, pairs=pairs))
+    assert mapped.notes[0] == "global mapping of stations"
+    assert mapped.models == (16,) and len(mapped.model.frames) == 8
+
+
 def test_the_scale_is_that_of_the_rig() -> None:
     """A rig given twice as large gives a model twice as large: nothing else sets the scale."""
     scene = make_scene(lines=1, stations=6, points=4000, noise_px=0.1)
