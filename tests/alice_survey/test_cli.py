@@ -18,7 +18,7 @@ from PIL import Image
 from typer.main import get_command
 from typer.testing import CliRunner
 
-from alice_survey.app.cli.main import app, main
+from alice_survey.app.cli.main import GROUPS, app, main
 from alice_survey.app.pipeline import init_survey
 from alice_survey.app.stages import names
 from alice_survey.core.config import CameraConfig, WaterConfig, load_config
@@ -50,6 +50,16 @@ def leaves(command: Any, *path: str) -> Iterator[tuple[str, ...]]:
             yield from leaves(below, *path, name)
 
 
+def test_each_command_stands_below_one_heading_and_the_ways_to_begin_parse() -> None:
+    parser: Any = get_command(app)
+    shown = [name for names in GROUPS.values() for name in names.split()]
+    assert sorted(shown) == sorted({path[0] for path in leaves(parser)})
+    ways = examples_of()
+    assert len(ways) == 3
+    for name, *arguments in ways:
+        parser.commands[name].make_context(name, arguments)
+
+
 @pytest.mark.parametrize("path", list(leaves(get_command(app))), ids=" ".join)
 def test_every_command_explains_itself_with_examples(path: tuple[str, ...]) -> None:
     examples = examples_of(*path)
@@ -64,7 +74,7 @@ def test_every_command_explains_itself_with_examples(path: tuple[str, ...]) -> N
 def examples_of(*path: str) -> list[list[str]]:
     shown = CliRunner().invoke(app, [*path, "--help"])
     found = re.findall(rf"^ +alice-survey ({' '.join(path)}.*)$", shown.output, re.MULTILINE)
-    return [shlex.split(example) for example in found]
+    return [shlex.split(example, comments=True) for example in found]
 
 
 @pytest.mark.parametrize("command", ["target", "fov", "init"])

@@ -12,6 +12,7 @@ from typing import Annotated, Any
 
 import typer
 from pydantic import ValidationError
+from typer.core import TyperGroup
 
 from alice_survey.app.commands import COMMANDS
 from alice_survey.app.commands.base import CommandModel, WorkspaceCommand, option
@@ -24,6 +25,21 @@ _SHARED = ("workspace", "survey", "threads", "scheduler", "cluster", "device", "
 """Fields that come last in the help."""
 _VEHICLE = "The vehicle: coefficients from geometry and from logs, and how its two forms compare."
 """Help of the group of commands that is no command itself."""
+GROUPS = {
+    "Start": "studio demo run status",
+    "Plan": "init plan fov",
+    "Vehicle": "fly pilot vehicle import-log",
+    "Camera": "target calibrate camera image",
+    "Pictures": "import-images quality join import-control control",
+    "Model": "reconstruct measure evaluate",
+    "Share": "report mosaic-tiles",
+}
+"""Headings of the first help, and their commands."""
+_ROADS = """\b
+Three ways to begin:
+  alice-survey demo                           # a small survey, from plan to report
+  alice-survey import-images PHOTOS -w dive   # your pictures; it says what is next
+  alice-survey init reef --area reef.kml      # a survey to plan and fly"""
 RENAMED = {
     "simulate": "pilot --simulated",
     "scale": "control",
@@ -67,14 +83,26 @@ class StudioCommand(WorkspaceCommand):
         run_studio(self.workspace, self.port, browser=self.browser, show=typer.echo, log=self.log)
 
 
+class _Grouped(TyperGroup):
+    """Commands below the headings of `GROUPS`."""
+
+    def format_commands(self, ctx: typer.Context, formatter: Any) -> None:  # type: ignore[override]
+        """Write the lists of commands."""
+        for heading, names in GROUPS.items():
+            with formatter.section(heading):
+                rows = [(name, self.commands[name]) for name in names.split()]
+                width = formatter.width - 18
+                formatter.write_dl([(n, one.get_short_help_str(width)) for n, one in rows])
+
+
 def make_app(commands: Sequence[type[CommandModel]] = (*COMMANDS, StudioCommand)) -> typer.Typer:
     """The program of some commands; those of two words are below the group of the first."""
     app = typer.Typer(
         name="alice-survey",
         help="Plan, fly, image and reconstruct close-range underwater imaging surveys, and score "
         "them.",
-        epilog="A first survey, planned, flown, pictured, reconstructed and scored: alice-survey "
-        "demo",
+        cls=_Grouped if StudioCommand in commands else None,
+        epilog=_ROADS,
         no_args_is_help=True,
         pretty_exceptions_enable=False,
         context_settings=CONTEXT,
