@@ -38,7 +38,7 @@ BOUNDS = {
     "modules with a single importer": 71,
     "kernels": 241,
     "commands": 36,
-    "options of commands": 349,
+    "options of commands": 350,
     "settings": 125,
     "functions that take the whole SurveyConfig": 14,
     "layers of the import contract": 8,

@@ -505,7 +505,7 @@ def import_images(
     if not overwrite:
         taken = [path for folder in scan.every_folder for path in folder.pictures]
         taken += [*scan.videos, *([bag] if bag else [])]
-        _refuse_others(workspace, taken, ", or give --replace")
+        _refuse_others(workspace, taken, ", or 'import-images --replace'")
     frame_overlap = DEFAULT_OVERLAP if overlap is None else overlap
     stage = artefacts.Stage(
         name="images",
@@ -644,7 +644,7 @@ def _refuse_others(workspace: Path, pictures: Sequence[Path], way_on: str) -> No
     if before:
         raise WorkspaceError(
             f"{workspace} holds pictures such as {next(iter(before))}, which others would replace: "
-            f"choose another workspace with -w{way_on}"
+            f"choose another workspace{way_on}"
         )
 
 

@@ -22,7 +22,7 @@ from alice_survey.app.cli.main import GROUPS, app, main
 from alice_survey.app.pipeline import init_survey
 from alice_survey.app.stages import names
 from alice_survey.core.config import CameraConfig, WaterConfig, load_config
-from alice_survey.core.errors import ImageError, PlanError, extra, offer
+from alice_survey.core.errors import ImageError, PlanError, WorkspaceError, extra, offer
 from camera_calib.rig import design_rig, write_rig
 
 
@@ -299,3 +299,29 @@ cli.main()
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
     )
     assert done.stdout.split() == ["600.0", "1"]
+
+
+def test_pictures_become_a_report_in_one_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Stages stand in; a second call goes on, and other pictures are refused."""
+    for name, value in (("a", 90), ("b", 110)):
+        (tmp_path / name).mkdir()
+        for k in (0, 1):
+            Image.new("L", (64, 48), value + k).save(tmp_path / name / f"{k}.png")
+    ran: list[tuple[str, Path]] = []
+
+    def made(stages: list[str], workspace: Path, *_: Any) -> tuple[str, dict[str, Any]]:
+        ran.extend((stage, workspace) for stage in stages)
+        return "text", {}
+
+    monkeypatch.setattr("alice_survey.app.pipeline.run", made)
+    dive = tmp_path / "dive"
+    for _ in range(2):
+        done = CliRunner().invoke(app, ["reconstruct", str(tmp_path / "a"), "-o", str(dive)])
+        assert done.exit_code == 0, done.output
+        assert ran == [(n, dive) for n in (*names("calibrate", "reconstruct"), "report")]
+        assert (dive / "images").is_dir() and not list((tmp_path / "a").glob("*/"))
+        ran.clear()
+    refused = CliRunner().invoke(app, ["reconstruct", str(tmp_path / "b"), "-o", str(dive)])
+    assert isinstance(refused.exception, WorkspaceError) and not ran

@@ -37,9 +37,9 @@ GROUPS = {
 """Headings of the first help, and their commands."""
 _ROADS = """\b
 Three ways to begin:
-  alice-survey demo                           # a small survey, from plan to report
-  alice-survey import-images PHOTOS -w dive   # your pictures; it says what is next
-  alice-survey init reef --area reef.kml      # a survey to plan and fly"""
+  alice-survey demo                        # a small survey, from plan to report
+  alice-survey reconstruct PHOTOS -o dive  # a folder of pictures, to the report
+  alice-survey init reef --area reef.kml   # a survey to plan and fly"""
 RENAMED = {
     "simulate": "pilot --simulated",
     "scale": "control",

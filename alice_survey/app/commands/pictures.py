@@ -219,11 +219,13 @@ class ImportLogCommand(ReportCommand):
 class ReconstructCommand(DeviceCommand):
     """Turn pictures into a model.
 
-    Camera track, DEM, point cloud, orthomosaic and textured mesh.
+    Camera track, DEM, point cloud, orthomosaic and textured mesh. With -o from a folder of pictures
+    to the report; 'import-images' takes navigation, rigs and videos.
     """
 
     name = "reconstruct"
     examples = (
+        "reconstruct photos -o dive",
         "reconstruct -w reef",
         "reconstruct -w reef --threads 2 --json",
         "reconstruct -w reef --scheduler tcp://10.0.0.1:8786",
@@ -233,6 +235,10 @@ class ReconstructCommand(DeviceCommand):
     )
     title = "Reconstruct the sea floor"
     offered = ("plane", "crs", "export", "threads")
+    output: Path | None = option(
+        None, "Take WORKSPACE for a folder of pictures of one camera: import them into this new "
+        "one, and end with the report.", "-o", "--output", metavar="DIR",
+    )  # fmt: skip
     plane: list[str] | None = option(
         None, "Plane of DEM and mosaic, any number: level, auto (the best one), or 'NAME=facing "
         "DEGREES tilt DEGREES': where the surface faces, and its lean back.",
@@ -257,6 +263,14 @@ class ReconstructCommand(DeviceCommand):
         """Run the stages, then write for other programs."""
         from alice_survey.app.pipeline import run
 
+        if self.output is not None:
+            shared = {"workspace": self.output, "threads": self.threads}
+            ImportImagesCommand(folders=[self.workspace], **shared).run()
+            rest = self.model_copy(update={"workspace": self.output, "output": None})
+            text, values = rest.run()
+            self.say(text)
+            more, values["report"] = run(["report"], self.output, self.survey, self.executor())
+            return f"{text}\n{more}", values
         with self.started_executor(self.device) as executor:
             changes = {"reconstruct": {"planes": self.plane}}
             text, values = run(self.stages(), self.workspace, self.survey, executor, changes)
