@@ -110,8 +110,7 @@ class Calibration:
     @property
     def drawn_points(self) -> Array:
         """(N, 3) points of the target as drawn, metres."""
-        drawn: Array = self.target_points - self.shape.offsets_m
-        return drawn
+        return self.target_points - self.shape.offsets_m
 
     @property
     def shared(self) -> Array:
@@ -126,8 +125,7 @@ class Calibration:
             return self.spread.shared[: len(covariance.parameters)]
         prior = self.freedom.prior
         at = [covariance.parameters.index(name) for name in prior.parameters]
-        factor: Array = covariance.matrix[:, at] @ np.linalg.cholesky(prior.information)
-        return factor
+        return covariance.matrix[:, at] @ np.linalg.cholesky(prior.information)
 
     @property
     def sigma_px(self) -> Array:

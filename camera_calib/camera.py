@@ -180,8 +180,7 @@ class Camera:
         """The points, (..., 3), where the rays of pixels (..., 2) reach z = depth_m in `cam`."""
         points, directions = self.unproject(pixels)
         reach = (np.asarray(depth_m) - points[..., 2]) / directions[..., 2]
-        hits: Array = points + reach[..., None] * directions
-        return hits
+        return points + reach[..., None] * directions
 
     def in_air(self) -> "Camera":
         """The same camera without its port."""

@@ -52,8 +52,7 @@ class Triangulation:
     @property
     def sigmas_m(self) -> Array:
         """(N, 3) standard deviations from the noise of the pixels alone."""
-        sigmas: Array = np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
-        return sigmas
+        return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
 
 
 def triangulate(
@@ -162,8 +161,7 @@ def rays_world(
 def _are_regular(matrices: Array) -> NDArray[np.bool_]:
     """(N,) which symmetric matrices (N, 3, 3) have an inverse beyond rounding."""
     values = np.linalg.eigvalsh(matrices)
-    regular: NDArray[np.bool_] = values[:, 0] > _SINGULAR * values[:, -1]
-    return regular
+    return values[:, 0] > _SINGULAR * values[:, -1]
 
 
 def _equations(

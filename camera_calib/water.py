@@ -123,8 +123,7 @@ def phase_per_sr(cosine: Array) -> Array:
         cosine: cosine of the angle by which light is turned (1 is forward).
     """
     g = ASYMMETRY
-    phase: Array = (1.0 - g * g) / (4.0 * np.pi * (1.0 + g * g - 2.0 * g * cosine) ** 1.5)
-    return phase
+    return (1.0 - g * g) / (4.0 * np.pi * (1.0 + g * g - 2.0 * g * cosine) ** 1.5)
 
 
 def water_report(
@@ -234,5 +233,4 @@ def n_glass(wavelength_nm: ArrayLike) -> Array:
         raise ConfigError(f"wavelength {nm} nm: glasses are known from 380 to 1050 nm")
     square_um = (nm * 1e-3) ** 2
     terms = (b * square_um / (square_um - c) for b, c in _BK7)
-    index: Array = np.sqrt(1.0 + sum(terms, start=np.zeros_like(square_um)))
-    return index
+    return np.sqrt(1.0 + sum(terms, start=np.zeros_like(square_um)))

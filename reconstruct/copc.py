@@ -93,8 +93,7 @@ class PointSpool:
     def points(self, key: Key, names: Iterable[str]) -> Records:
         """The points of a cube in parts."""
         files = [np.fromfile(self._path(key, name), self.dtype) for name in names]
-        points: Records = np.concatenate(files)
-        return points
+        return np.concatenate(files)
 
     def cube_folder(self, key: Key) -> Path:
         """Where the points of a cube wait."""
@@ -166,8 +165,7 @@ def _extremes(points: Records) -> Records:
     """Points that have the least and the greatest value of every field."""
     fields = [points[name] for name in points.dtype.names or ()]
     at = {int(find(values)) for values in fields for find in (np.argmin, np.argmax)}
-    extremes: Records = points[sorted(at)]
-    return extremes
+    return points[sorted(at)]
 
 
 def _by_return(points: Records) -> NDArray[np.uint64]:

@@ -65,10 +65,7 @@ class Elevation:
         """
         x = (places_en[..., 0] - self.west) / self.cell - 0.5
         y = (self.north - places_en[..., 1]) / self.cell - 0.5
-        between: Array = map_coordinates(
-            field, [y, x], np.float64, order=1, mode="constant", cval=np.nan
-        )
-        return between
+        return map_coordinates(field, [y, x], np.float64, order=1, mode="constant", cval=np.nan)
 
     def met_by(self, starts: Array, ways: Array) -> Array:
         """Where rays first meet the surface from above, (N, 3) in the world; NaN where none does.

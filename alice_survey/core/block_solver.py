@@ -154,14 +154,12 @@ class Equations:
     def information(self) -> Array:
         """(G, G) information on what is shared, the poses marginalised."""
         reduced = product_of(self.border[..., :-1], self.response)
-        information: Array = self.shared[:-1, :-1] + 0.5 * (reduced + reduced.T)
-        return information
+        return self.shared[:-1, :-1] + 0.5 * (reduced + reduced.T)
 
     def covariance_times(self, right: Array) -> Array:
         """The covariance of the poses, what is shared marginalised, times (F, K, R)."""
         inner = inverse_of(self.information) @ product_of(self.response, right)
-        product: Array = self.undamped.solve(right) + self.response @ inner
-        return product
+        return self.undamped.solve(right) + self.response @ inner
 
     def covariance_blocks(self) -> Array:
         """(B, K, K) covariances of those poses between which there are blocks."""
@@ -253,8 +251,7 @@ class PoseFactor:
 
 def product_of(first: Array, second: Array) -> Array:
     """Sum over all poses, (A, B), of (F, K, A) transposed times (F, K, B)."""
-    product: Array = np.tensordot(first, second, axes=([0, 1], [0, 1]))
-    return product
+    return np.tensordot(first, second, axes=([0, 1], [0, 1]))
 
 
 def inverse_of(matrix: Array) -> Array:

@@ -254,8 +254,7 @@ def compiled_ieee(function: Callable[_Arguments, _Result]) -> Callable[_Argument
 
     Other threads run meanwhile.
     """
-    kernel: Callable[_Arguments, _Result] = compiled(error_model="numpy", nogil=True)(function)
-    return kernel
+    return compiled(error_model="numpy", nogil=True)(function)
 
 
 def kernel(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
@@ -264,8 +263,7 @@ def kernel(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Res
     Without numba's runtime a function that would allocate an array does not compile, and none
     spends time on counting references: equations of motion run seven times as fast.
     """
-    kept: Callable[_Arguments, _Result] = compiled(_nrt=False, error_model="numpy")(function)
-    return kept
+    return compiled(_nrt=False, error_model="numpy")(function)
 
 
 def columns(count: int) -> tuple[int, ...]:

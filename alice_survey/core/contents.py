@@ -78,8 +78,7 @@ def where_unknown(values: "NDArray[np.float64]") -> "NDArray[np.bool_]":
     """`is_unknown` of numbers, (...)."""
     import numpy as np
 
-    found: NDArray[np.bool_] = ~(np.abs(values) < BEYOND) | np.isin(values, UNKNOWN)
-    return found
+    return ~(np.abs(values) < BEYOND) | np.isin(values, UNKNOWN)
 
 
 def is_nowhere(latitude_deg: float | None, longitude_deg: float | None) -> bool:

@@ -69,14 +69,12 @@ class Datum:
         """Take (N, 3) rows of latitude and longitude (degrees) and depth (m) to NED metres."""
         rows = np.asarray(lat_lon_depth, dtype=np.float64).reshape(-1, 3)
         ecef = self._ecef.transform(rows[:, 1], rows[:, 0], self.height_m - rows[:, 2])
-        ned: Array = self._ned_from_ecef.apply(np.stack(ecef, axis=1) - self._origin_ecef)
-        return ned
+        return self._ned_from_ecef.apply(np.stack(ecef, axis=1) - self._origin_ecef)
 
     def ecef_from_ned(self, points_ned: Array) -> Array:
         """Take (N, 3) NED metres to geocentric coordinates (EPSG:4978), metres."""
         points = np.asarray(points_ned, dtype=np.float64).reshape(-1, 3)
-        ecef: Array = self._ned_from_ecef.inv().apply(points) + self._origin_ecef
-        return ecef
+        return self._ned_from_ecef.inv().apply(points) + self._origin_ecef
 
     def geodetic_from_ned(self, points_ned: Array) -> Array:
         """Take (N, 3) NED metres to rows of latitude and longitude (degrees) and depth (m)."""
@@ -87,8 +85,7 @@ class Datum:
     def lon_lat_from_en(self, places_en: Array) -> Array:
         """Take (N, 2) metres east and north, at the datum's height, to longitude and latitude."""
         ned = np.column_stack([places_en[:, ::-1], np.zeros(len(places_en))])
-        found: Array = self.geodetic_from_ned(ned)[:, 1::-1]
-        return found
+        return self.geodetic_from_ned(ned)[:, 1::-1]
 
     @property
     def utm_epsg(self) -> int:

@@ -111,8 +111,7 @@ def pressure_dbar(depth_m: ArrayLike) -> NDArray[np.float64]:
     c1 = 5.92e-3 + 5.25e-3 * math.sin(math.radians(45.0)) ** 2
     c2 = 2.21e-6
     depth = np.asarray(depth_m, dtype=np.float64)
-    pressure: NDArray[np.float64] = ((1 - c1) - np.sqrt((1 - c1) ** 2 - 4 * c2 * depth)) / (2 * c2)
-    return pressure
+    return ((1 - c1) - np.sqrt((1 - c1) ** 2 - 4 * c2 * depth)) / (2 * c2)
 
 
 def _at_surface(t: Any, s: Any, nm: Any) -> Any:

@@ -63,13 +63,11 @@ class Pinhole:
 
     def pixels(self, slopes: Array) -> Array:
         """Pixels (..., 2) of rays with slopes x/z and y/z (..., 2)."""
-        found: Array = slopes * self.numbers[:2] + self.numbers[2:]
-        return found
+        return slopes * self.numbers[:2] + self.numbers[2:]
 
     def slopes(self, pixels: Array) -> Array:
         """The inverse of `pixels`."""
-        found: Array = (pixels - self.numbers[2:]) / self.numbers[:2]
-        return found
+        return (pixels - self.numbers[2:]) / self.numbers[:2]
 
     def project(self, points: Array) -> Array:
         """Pixels (..., 2) of points (..., 3) in the pinhole's frame; NaN unless z is positive."""

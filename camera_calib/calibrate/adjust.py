@@ -201,8 +201,7 @@ class _Solver(CalibrationProblem):
     def weights(self, guess: _TargetGuess, noise: Array) -> Array:
         """(V, C, N) Huber's weights; 0 where unseen."""
         length = np.where(self.seen, guess.lengths / noise, 0.0)
-        weights: Array = np.where(self.seen, HUBER / np.maximum(length, HUBER), 0.0)
-        return weights
+        return np.where(self.seen, HUBER / np.maximum(length, HUBER), 0.0)
 
     def result(self, found: Minimum[_TargetGuess, Equations]) -> Adjustment:
         """The adjusted rig and poses, with the covariance at this guess."""

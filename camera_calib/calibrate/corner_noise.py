@@ -45,8 +45,7 @@ class _Part:
         """The correlation applied to (V, C, N, 2, m), with (V, C, N) of 0 where unseen."""
         base = values.sum(axis=1, keepdims=True) if self.in_all else values
         spread = self.kernel @ base.reshape(*base.shape[:3], -1)
-        out: Array = spread.reshape(base.shape) * seen[..., None, None]
-        return out
+        return spread.reshape(base.shape) * seen[..., None, None]
 
 
 class _Weighted:
@@ -167,8 +166,7 @@ class _Products:
         # Under independent errors the products' covariance is twice the table.
         root = np.linalg.cholesky(table * np.outer(scale, scale) + 1e-12 * np.eye(size))
         found = nnls(root.T, solve_triangular(root, seen * scale, lower=True))[0]
-        variances: Array = found * scale
-        return variances
+        return found * scale
 
     def _of_pictures(self) -> Array:
         """(K, K) tr(K_i M K_j M) of the parts within pictures."""
@@ -181,8 +179,7 @@ class _Products:
                 both = one.kernel * other.kernel
                 table[i, j] = table[j, i] = 2.0 * float(((seen @ both) * seen).sum())
         table -= 2.0 * (_inner(self.poses) + _inner(self.smooth) - _inner(self.crossed))
-        total: Array = table + _inner(self.overlap) + _inner(self.by_rig)
-        return total
+        return table + _inner(self.overlap) + _inner(self.by_rig)
 
     def _of_both(self, i: int) -> list[float]:
         """Of one part within pictures and the places, by axes."""
@@ -218,5 +215,4 @@ class _Products:
 def _inner(values: Array) -> Array:
     """(K, K) inner products of K arrays."""
     flat = values.reshape(len(values), -1)
-    products: Array = flat @ flat.T
-    return products
+    return flat @ flat.T

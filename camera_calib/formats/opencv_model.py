@@ -261,8 +261,7 @@ def fit_camera(
 
     def errors(unknowns: Array) -> Array:
         seen = pose(unknowns).apply(points.reshape(-1, 3)).reshape(points.shape)
-        found: Array = np.nan_to_num(camera(unknowns).project(seen) - pixels, nan=_FOLDED_PX)
-        return found
+        return np.nan_to_num(camera(unknowns).project(seen) - pixels, nan=_FOLDED_PX)
 
     def cost(unknowns: Array) -> Array:
         regular = _CANCELLING_PX * unknowns[pose_unknowns + 4 :]

@@ -50,8 +50,7 @@ class FocusedLens:
 
     def blur_px(self, depth_m: Array | float) -> Array:
         """Diameter of the blur circle of points that appear at a depth in air, px."""
-        blur: Array = self.defocus_px * np.abs(1.0 / np.asarray(depth_m) - 1.0 / self.focus_m)
-        return blur
+        return self.defocus_px * np.abs(1.0 / np.asarray(depth_m) - 1.0 / self.focus_m)
 
     def sharp_depths_m(self, coc_px: float) -> tuple[float, float]:
         """Nearest and farthest apparent depth whose blur circle is at most coc_px; far may be inf.
@@ -84,8 +83,7 @@ class ApparentDepths:
 
     def at(self, altitude_m: float) -> Array:
         """Apparent depths, (N, 2), of a sea floor at an altitude of the outer glass."""
-        depths: Array = (self.offset_m + self.slope * altitude_m) / (1.0 + self.far * altitude_m)
-        return depths
+        return (self.offset_m + self.slope * altitude_m) / (1.0 + self.far * altitude_m)
 
     def altitudes_m(self, depth_m: float) -> Array:
         """The inverse of `at`, (N, 2): altitudes that appear at a depth; inf beyond all."""

@@ -152,8 +152,7 @@ class Profile:
     @property
     def centres(self) -> Array:
         """(B,) centres of the bins."""
-        centres: Array = (self.edges[1:] + self.edges[:-1]) / 2
-        return centres
+        return (self.edges[1:] + self.edges[:-1]) / 2
 
 
 def profile(

@@ -121,8 +121,7 @@ def compensation(rig: Rig, camera: str, anchors_cam: Array) -> Array:
 def taken_up(slopes: Array, moved: Array) -> Array:
     """Unknowns (K, P), the least ones, whose slopes (M, K) come nearest to what moved (M, P)."""
     inverse = np.linalg.pinv(slopes.T @ slopes, rcond=1e-14, hermitian=True)
-    found: Array = np.asarray(inverse @ (slopes.T @ moved), dtype=np.float64)
-    return found
+    return np.asarray(inverse @ (slopes.T @ moved), dtype=np.float64)
 
 
 def frame_points(camera: Camera, ranges_m: tuple[float, ...]) -> Array:
@@ -260,15 +259,13 @@ def overlap_points(rig: Rig, range_m: float) -> Array:
     count = np.zeros(len(points), dtype=int)
     for camera, model in rig.cameras.items():
         count += _in_frame(model, model.project(rig.cam_from_rig[camera].apply(points)))
-    kept: Array = points[count >= 2]
-    return kept
+    return points[count >= 2]
 
 
 def _in_frame(camera: Camera, pixels: Array) -> NDArray[np.bool_]:
     x, y = pixels[:, 0], pixels[:, 1]
     right, bottom = camera.width_px + _EDGE_PX, camera.height_px + _EDGE_PX
-    inside: NDArray[np.bool_] = (x >= -_EDGE_PX) & (x <= right) & (y >= -_EDGE_PX) & (y <= bottom)
-    return inside
+    return (x >= -_EDGE_PX) & (x <= right) & (y >= -_EDGE_PX) & (y <= bottom)
 
 
 @dataclass(frozen=True, kw_only=True)

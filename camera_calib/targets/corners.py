@@ -110,8 +110,7 @@ def linear_light(picture: NDArray[np.uint8]) -> Array:
     """Undo the sRGB curve (IEC 61966-2-1): 8-bit grey values to 0 to 1, linear."""
     encoded = np.arange(256) / 255.0
     table = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
-    linear: Array = table[picture]
-    return linear
+    return table[picture]
 
 
 def _light(picture: Grey) -> Array:

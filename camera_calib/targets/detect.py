@@ -128,8 +128,7 @@ def as_grey(picture: Picture) -> Grey:
         return np.ascontiguousarray(flat, dtype=np.uint8)
     # Cameras of 10 or 12 bits fill a part of the range only.
     brightest = max(float(np.percentile(flat[::4, ::4], 99.9)), 1.0)
-    linear: NDArray[np.float32] = np.minimum(flat / np.float32(brightest), np.float32(1.0))
-    return linear
+    return np.minimum(flat / np.float32(brightest), np.float32(1.0))
 
 
 def chessboard_size(grey: Grey) -> tuple[int, int] | None:

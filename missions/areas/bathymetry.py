@@ -133,8 +133,7 @@ class Bathymetry:
                 np.minimum(row + d_row, rows - 1), np.minimum(col + d_col, columns - 1)
             ]
             total += np.where(weight > 0.0, weight * cell, 0.0)
-        depth: Array = np.where(inside, total, np.nan)
-        return depth
+        return np.where(inside, total, np.nan)
 
     def _pixel_from_ne(self, points_ne: Array) -> Array:
         """(N, 2) column and row of places (N, 2) on the sea floor, in the file's own corners."""
@@ -313,8 +312,7 @@ def _snap(share: Array) -> Array:
 def _pixels(from_pixel: tuple[float, ...], x: Array, y: Array) -> Array:
     """(N, 2) column and row of places in the raster's own coordinates."""
     a, b, c, d, e, f = from_pixel
-    pixels: Array = np.linalg.solve(np.array([[a, b], [d, e]]), np.stack([x - c, y - f])).T
-    return pixels
+    return np.linalg.solve(np.array([[a, b], [d, e]]), np.stack([x - c, y - f])).T
 
 
 def _transformer(crs: str) -> Any:

@@ -121,8 +121,7 @@ def from_geometries(origin: str, geometries: Iterable[BaseGeometry]) -> RawShape
     points: list[Array] = []
 
     def corners(geometry: BaseGeometry) -> Array:
-        found: Array = shapely.get_coordinates(geometry)[:, [1, 0]]
-        return found
+        return shapely.get_coordinates(geometry)[:, [1, 0]]
 
     waiting = list(geometries)[::-1]
     while waiting:

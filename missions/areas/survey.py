@@ -336,8 +336,7 @@ def _rectangle(settings: AreaConfig) -> Array:
     heading = math.radians(settings.heading_deg)
     along = settings.length_m * np.array([math.cos(heading), math.sin(heading)])
     right = settings.width_m * np.array([-math.sin(heading), math.cos(heading)])
-    corners: Array = np.array([0 * along, along, along + right, right])
-    return corners
+    return np.array([0 * along, along, along + right, right])
 
 
 def repair(

@@ -92,8 +92,7 @@ class Certificate:
         everywhere in an endless pattern.
         """
         often = self.least_pictures >= self.pattern.passes * self.pattern.pictures
-        covered: NDArray[np.bool_] = often & (self.least_lines >= self.pattern.passes)
-        return covered
+        return often & (self.least_lines >= self.pattern.passes)
 
     @property
     def covered_share(self) -> float:

@@ -60,8 +60,7 @@ class Grid:
 
     def places_of(self, cells: Array) -> Array:
         """The inverse of `cells_of`."""
-        places: Array = np.array(self.origin_ne) + self.cell_m * (cells @ self.axes)
-        return places
+        return np.array(self.origin_ne) + self.cell_m * (cells @ self.axes)
 
     def sample(self, values: NDArray[Any], places_ne: Array, outside: float) -> NDArray[Any]:
         """Values, (rows, columns), of the cells that hold places (..., 2), or a value outside."""

@@ -213,10 +213,7 @@ def read_linear(file: Path, *, linear: bool) -> Floats | None:
 
 def _from_srgb(encoded: Array) -> Array:
     """Linear light of sRGB values, 0 to 1 (IEC 61966-2-1)."""
-    linear: Array = np.where(
-        encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4
-    )
-    return linear
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
 
 
 def picture_levels(picture: Floats) -> PictureLevels:

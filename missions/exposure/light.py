@@ -156,8 +156,7 @@ class LightBudget:
 def cone_intensity(cos_angle: Array, half_beam_rad: float) -> Array:
     """Intensity over radiant power, 1/sr: Lambert's cosine within a cone."""
     inside = np.where(cos_angle >= math.cos(half_beam_rad), cos_angle, 0.0)
-    share: Array = inside / (math.pi * math.sin(half_beam_rad) ** 2)
-    return share
+    return inside / (math.pi * math.sin(half_beam_rad) ** 2)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -219,8 +218,7 @@ def floor_radiance(
 
 def weakened_per_m(water: WaterOptics, kept: float) -> Array:
     """Attenuation (3,) of light of which a share of what is scattered counts as kept."""
-    weakened: Array = water.absorption_per_m + (1.0 - kept) * water.scattering_per_m
-    return weakened
+    return water.absorption_per_m + (1.0 - kept) * water.scattering_per_m
 
 
 def electrons_per_radiance(limits: CameraConfig, n_water: float, exposure_s: float) -> Array:
@@ -229,8 +227,7 @@ def electrons_per_radiance(limits: CameraConfig, n_water: float, exposure_s: flo
     irradiance = math.pi * in_air * LENS_TRANSMITTANCE / (4.0 * limits.f_number**2)
     energy_j = irradiance * (limits.pixel_um * 1e-6) ** 2 * exposure_s
     photon_j = _PLANCK_J_S * _LIGHT_M_S / (WAVELENGTH_NM * 1e-9)
-    electrons: Array = limits.quantum_efficiency * energy_j / photon_j
-    return electrons
+    return limits.quantum_efficiency * energy_j / photon_j
 
 
 def lens_falloff(rig: Rig, pixels: Array) -> Array:
@@ -290,8 +287,7 @@ def light_budget(
 
 def signal_to_noise(electrons: Array, read_noise_e: float, sharp: Array | float) -> Array:
     """Detail over noise: sharp electrons over the shot noise of all and the read noise."""
-    ratio: Array = sharp / np.sqrt(electrons + read_noise_e**2)
-    return ratio
+    return sharp / np.sqrt(electrons + read_noise_e**2)
 
 
 def darkness(budget: LightBudget) -> str:
@@ -404,14 +400,12 @@ def veil_radiance(
         turned = cone_intensity(cos_beam, half_beam) / distance**2 * phase_per_sr(-cos_beam)
         sent += turned[:, None] * np.exp(-(distance + path)[:, None] * attenuation_per_m)
     power = imaging.strobe_lumens * watts_per_lumen(spectrum)
-    veil: Array = np.trapezoid(sent, path, axis=0) * power * water.scattering_per_m
-    return veil
+    return np.trapezoid(sent, path, axis=0) * power * water.scattering_per_m
 
 
 def _axis_paths(altitude_m: float) -> Array:
     """Paths along the axis from glass to floor, close to each other near the glass."""
-    paths: Array = altitude_m * (np.arange(_STEPS + 1) / _STEPS) ** 2
-    return paths
+    return altitude_m * (np.arange(_STEPS + 1) / _STEPS) ** 2
 
 
 def shadows(rig: Rig, imaging: ImagingConfig, altitude_m: float, height_m: float) -> Shadows:

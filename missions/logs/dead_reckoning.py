@@ -196,8 +196,7 @@ def _company(times_s: Array) -> Array:
     """How many fixes, (F,) sorted, are within the time over which fixes share errors."""
     half = 0.5 * _FIXES_S
     last = np.searchsorted(times_s, times_s + half, side="right")
-    found: Array = (last - np.searchsorted(times_s, times_s - half)).astype(np.float64)
-    return found
+    return (last - np.searchsorted(times_s, times_s - half)).astype(np.float64)
 
 
 def _smooth(

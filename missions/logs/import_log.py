@@ -397,8 +397,7 @@ def _tide_at(time_s: Array, tide: float | Signal) -> Array:
             f"{tide.source}: tides from {_moment(first)} to {_moment(last)} do not cover the "
             f"dive, {_moment(float(time_s[0]))} to {_moment(float(time_s[-1]))}"
         )
-    heights: Array = np.interp(time_s, tide.time_s, tide.values[:, 0])
-    return heights
+    return np.interp(time_s, tide.time_s, tide.values[:, 0])
 
 
 def read_tide(text: str, *, dated: bool) -> float | Signal:

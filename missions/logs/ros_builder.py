@@ -52,14 +52,12 @@ _UNKNOWN, _DIAGONAL = 0, 2
 
 def flipped_world(points: Array) -> Array:
     """NED to ENU or back, (..., 3): north and east change places, the vertical its sign."""
-    flipped: Array = np.stack([points[..., 1], points[..., 0], -points[..., 2]], axis=-1)
-    return flipped
+    return np.stack([points[..., 1], points[..., 0], -points[..., 2]], axis=-1)
 
 
 def flipped_body(vectors: Array) -> Array:
     """FRD to FLU or back, (..., 3): the second and third component change sign."""
-    flipped: Array = np.stack([vectors[..., 0], -vectors[..., 1], -vectors[..., 2]], axis=-1)
-    return flipped
+    return np.stack([vectors[..., 0], -vectors[..., 1], -vectors[..., 2]], axis=-1)
 
 
 def flipped_quaternion(quaternion_xyzw: Array) -> Array:
@@ -70,8 +68,7 @@ def flipped_quaternion(quaternion_xyzw: Array) -> Array:
     """
     x, y, z, w = np.moveaxis(np.asarray(quaternion_xyzw, dtype=np.float64), -1, 0)
     turned = _HALF_ROOT * np.stack([x + y, x - y, w - z, w + z], axis=-1)
-    positive: Array = np.where(turned[..., 3:] < 0, -turned, turned)
-    return positive
+    return np.where(turned[..., 3:] < 0, -turned, turned)
 
 
 class MessageBuilder:

@@ -37,14 +37,12 @@ class Area:
     @property
     def corners_ne(self) -> Array:
         """(N, 2) corners of the survey area, holes too."""
-        corners: Array = shapely.get_coordinates(self.survey)
-        return corners
+        return shapely.get_coordinates(self.survey)
 
     @property
     def allowed_corners_ne(self) -> Array:
         """(N, 2) corners of the allowed area: what a simulated sea floor must reach to."""
-        corners: Array = shapely.get_coordinates(self.allowed)
-        return corners
+        return shapely.get_coordinates(self.allowed)
 
     @property
     def rings_ne(self) -> list[Array]:

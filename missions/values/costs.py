@@ -172,8 +172,7 @@ def _at(power_w: Array, place: Array) -> Array:
     low = np.floor(place)
     index = low.astype(np.intp) % len(power_w)
     following = power_w[(index + 1) % len(power_w)]
-    value: Array = power_w[index] + (place - low) * (following - power_w[index])
-    return value
+    return power_w[index] + (place - low) * (following - power_w[index])
 
 
 def _integral(power_w: Array, place: Array) -> Array:

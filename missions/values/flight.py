@@ -105,8 +105,7 @@ class Flight:
         places = np.asarray(shapely.points(self.glass_ned[:, :2]))
         allowed = self.plan.area.allowed
         shapely.prepare(allowed)
-        outside: Array = shapely.distance(allowed, places)
-        return outside
+        return shapely.distance(allowed, places)
 
     def _cross_track(self, glass_ned: Array) -> Array:
         cross = np.full(len(self.line), np.nan)

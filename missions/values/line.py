@@ -41,8 +41,7 @@ class Line:
     def stations_ne(self) -> Array:
         """Where the pictures are taken, (stations, 2)."""
         t = np.linspace(0.0, 1.0, self.stations)[:, None]
-        places: Array = np.array(self.start_ne_m) * (1 - t) + np.array(self.end_ne_m) * t
-        return places
+        return np.array(self.start_ne_m) * (1 - t) + np.array(self.end_ne_m) * t
 
     def offsets_m(self, points_ne: Array) -> Array:
         """How far places (..., 2) are along the line from its start, and to starboard of it."""

@@ -265,8 +265,7 @@ def slope_deg(height: Float32, cell: float) -> Float32:
     padded = np.pad(height.astype(np.float64), 1, constant_values=np.nan)
     right, down = (cv2.Sobel(padded, cv2.CV_64F, *way)[1:-1, 1:-1] for way in ((1, 0), (0, 1)))
     steep = np.rad2deg(np.arctan(np.hypot(right, down) / (8 * cell)))
-    slope: Float32 = np.where(np.isfinite(height), steep, np.nan).astype(np.float32)
-    return slope
+    return np.where(np.isfinite(height), steep, np.nan).astype(np.float32)
 
 
 def without_strays(height: Float32) -> NDArray[np.bool_]:

@@ -157,7 +157,7 @@ def depth_in_reference(
         (H, W) depth, NaN where any of the four virtual pixels around is unknown.
     """
     rect_from_partner = _FROM_CORNER @ rectification.rect_from_partner
-    depth: NDArray[np.float32] = triangulate(
+    return triangulate(
         disparity_px,
         reference.pinhole.size_px[::-1],
         reference.kernel_lens,
@@ -169,7 +169,6 @@ def depth_in_reference(
         rectification.focal_px * rectification.baseline,
         rectification.disparity_offset_px,
     )
-    return depth
 
 
 @compiled(error_model="numpy", fastmath=FAST)
@@ -332,8 +331,7 @@ def undo_rounding(fixed: NDArray[np.int16]) -> Float32:
     """
     step = fixed % _STEPS
     lift = np.where(step > _STEPS // 2, 1.0, np.where(step == 0, 0.5, 0.0))
-    found: Float32 = fixed.astype(np.float32) - lift.astype(np.float32)
-    return found
+    return fixed.astype(np.float32) - lift.astype(np.float32)
 
 
 def without_mixed(disparity_px: Float32) -> Float32:

@@ -92,8 +92,7 @@ def even_contrast(grey: Float32) -> Float32:
     mean = _blur(grey, _CONTRAST_SIGMA_PX)
     rest: Float32 = grey - mean
     variance = _blur(rest * rest, _CONTRAST_SIGMA_PX) + np.float32(_MIN_CONTRAST**2)
-    even: Float32 = rest * (variance ** np.float32(-0.5))
-    return even
+    return rest * (variance ** np.float32(-0.5))
 
 
 def _blur(picture: Float32, sigma_px: float) -> Float32:

@@ -470,8 +470,7 @@ def settle(surface: NDArray[Any], cell: float, low: Array, high: Array) -> NDArr
     found = surface.copy()
     found["sigma"] = cell * np.sqrt(variance + excess + np.square(aside))
     found["normal"] = mean
-    kept: NDArray[Any] = found[large[part]]
-    return kept
+    return found[large[part]]
 
 
 def _aside(tree: cKDTree, place: Array, normal: Array) -> Array:

@@ -82,8 +82,7 @@ class ErrorsOfPoses:
             part = slice(start, start + _CHUNK)
             covariances = self.covariances[near[part]]
             found[part] = np.median(_along(covariances, normals_world[part, None]), axis=1)
-        sigmas: Array = np.sqrt(found)
-        return sigmas
+        return np.sqrt(found)
 
     @cached_property
     def _level_tree(self) -> cKDTree:
@@ -295,8 +294,7 @@ def fuse_tile(setup: FuseSetup, task: FuseTask) -> SurfaceTile:
 
 def _swap_axes(enu: Array) -> Array:
     """North, east, down of east, north, up, or the other way round."""
-    swapped: Array = enu[:, [1, 0, 2]] * [1.0, 1.0, -1.0]
-    return swapped
+    return enu[:, [1, 0, 2]] * [1.0, 1.0, -1.0]
 
 
 def on_plane(

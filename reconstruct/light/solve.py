@@ -234,8 +234,7 @@ def at_places(
     x = places[:, 0] * np.float32(width) - np.float32(0.5)
     y = places[:, 1] * np.float32(height) - np.float32(0.5)
     picture = np.ascontiguousarray(picture, np.float32).reshape(height, width, channels)
-    found: NDArray[np.float32] = bilinear(picture, x.astype(np.float32), y.astype(np.float32))
-    return found
+    return bilinear(picture, x.astype(np.float32), y.astype(np.float32))
 
 
 @compiled
@@ -392,8 +391,7 @@ def _middle_range(samples: LightSamples, _: None) -> float:
 
 
 def _views_of(samples: LightSamples, _: None) -> NDArray[np.int64]:
-    found: NDArray[np.int64] = np.unique(samples.views).astype(np.int64)
-    return found
+    return np.unique(samples.views).astype(np.int64)
 
 
 def _linear(
@@ -447,20 +445,17 @@ def bending() -> Array:
     """Normal matrix (nodes, nodes) of the second differences over a picture."""
     along, across = (np.diff(np.eye(count), 2, axis=0) for count in GRID[::-1])
     bend = np.vstack([np.kron(np.eye(GRID[0]), along), np.kron(across, np.eye(GRID[1]))])
-    found: Array = bend.T @ bend / _BEND_SIGMA**2
-    return found
+    return bend.T @ bend / _BEND_SIGMA**2
 
 
 def around_zero() -> Array:
     """Normal matrix (nodes, nodes) of a smooth pattern around 0."""
-    found: Array = bending() + np.eye(GRID[0] * GRID[1]) / _NODE_SIGMA**2
-    return found
+    return bending() + np.eye(GRID[0] * GRID[1]) / _NODE_SIGMA**2
 
 
 def _prior(cameras: int, fall_off_sigma: float) -> Array:
     """Normal matrix of smooth patterns around 0, and of a fall-off, last."""
-    found: Array = block_diag(*[around_zero()] * cameras, np.array([[fall_off_sigma**-2]]))
-    return found
+    return block_diag(*[around_zero()] * cameras, np.array([[fall_off_sigma**-2]]))
 
 
 def _typical(nodes: Array, camera_of: NDArray[np.int64], cameras: int) -> tuple[Array, Array]:

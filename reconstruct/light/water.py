@@ -238,8 +238,7 @@ def _slope_of_growth(growth: float, ranges: Array, middle: float) -> Array:
     def one(z: Array | float) -> Array:
         return np.asarray(growth * z / np.expm1(growth * np.asarray(z)))
 
-    found: Array = one(ranges) - one(middle)
-    return found
+    return one(ranges) - one(middle)
 
 
 def _noise(rest: Array, step: _PairEquations) -> Array:
@@ -263,8 +262,7 @@ def _weights(rest: Array, step: _PairEquations, noise: Array, robust: bool) -> A
     if robust:
         far = np.sqrt(np.einsum("ni,nij,nj->n", rest, inverse, rest) / 3.0)
         weight = weight / np.maximum(far, 1.0)
-    found: Array = inverse * weight[:, None, None]
-    return found
+    return inverse * weight[:, None, None]
 
 
 def _normal(step: _PairEquations, gain: csr_array, weights: Array) -> tuple[csr_array, Array]:

@@ -53,8 +53,7 @@ class Observed:
         for n, number in enumerate(self.pictures.tolist()):
             rows = self.of(n)
             found[rows] = model.images[number].camera.img_from_cam(self.in_cameras[rows])
-        missed: Array = found - self.pixels
-        return missed
+        return found - self.pixels
 
 
 def frames_of(model: pycolmap.Reconstruction) -> Indices:
@@ -103,8 +102,7 @@ def model_groups(model: pycolmap.Reconstruction) -> Indices:
 
 def first_of(group: Indices) -> Indices:
     """Which station is the first of each group, (K,), from the groups of stations (F,)."""
-    first: Indices = np.unique(group, return_index=True)[1]
-    return first
+    return np.unique(group, return_index=True)[1]
 
 
 def first_pictures(model: pycolmap.Reconstruction, given: Array | None = None) -> dict[int, int]:

@@ -200,8 +200,7 @@ def dense_features(grey: NDArray[np.uint8]) -> tuple[Floats, Floats, Floats]:
 def sample(field: Floats, at: Array) -> Array:
     """Values (N, C) of a field (H, W, C) at places (N, 2), x and y, bilinear; held at its rim."""
     where = np.broadcast_arrays(at[:, 1:], at[:, :1], np.arange(field.shape[2]))
-    values: Array = map_coordinates(field, where, np.float64, order=1, mode="nearest")
-    return values
+    return map_coordinates(field, where, np.float64, order=1, mode="nearest")
 
 
 @lru_cache(maxsize=1)

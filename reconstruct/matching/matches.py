@@ -291,8 +291,7 @@ def apply_homography(homography: Array, pixels: Array) -> Array:
     middle = np.array([*pixels.mean(axis=0), 1.0]) @ homography.T
     ahead = moved[:, 2] * middle[2] > 0
     w = np.where(ahead, moved[:, 2], np.nan)
-    found: Array = moved[:, :2] / w[:, None]
-    return found
+    return moved[:, :2] / w[:, None]
 
 
 def verify(task: PairTask, seen: tuple[Array, Array], matches: Matches) -> PairMatches:

@@ -641,5 +641,4 @@ def _nearest_words(
 def _sums(rows: NDArray[np.float32], word: NDArray[np.intp], words: int) -> Array:
     """Sums, (W, D), of rows (N, D) by word."""
     member = csr_array((np.ones(len(word)), (word, np.arange(len(word)))), (words, len(word)))
-    found: Array = member @ rows.astype(np.float64)
-    return found
+    return member @ rows.astype(np.float64)

@@ -116,8 +116,7 @@ def track_references(
     label = connected_components(graph, directed=False)[1]
     order = np.lexsort((np.arange(count), -degree, label))
     first = np.flatnonzero(np.r_[True, np.diff(label[order]) != 0][:count])
-    reference: NDArray[np.int64] = order[first][label].astype(np.int64)
-    return reference
+    return order[first][label].astype(np.int64)
 
 
 def _tasks(

@@ -52,8 +52,7 @@ class Atlas:
 
     def place(self, pixels: Array, chart: NDArray[np.int32]) -> Array:
         """Pixels (W, 2) of pictures, in each one's patch, to pixels of the patches' pages."""
-        placed: Array = pixels * self.scale - self.source[chart] + self.corner[chart]
-        return placed
+        return pixels * self.scale - self.source[chart] + self.corner[chart]
 
     def part(self, mine: NDArray[np.int64]) -> "Atlas":
         """The same pages with some of the patches."""

@@ -271,10 +271,9 @@ def seam_colours(workspace: Path, task: tuple[View, Float32, Array]) -> Float32:
         )
         for picture in (total, share)
     )
-    found: Float32 = np.where(
+    return np.where(
         shares[:, None] > 0.1, sums / np.maximum(shares, 0.1)[:, None], np.float32(np.nan)
     )
-    return found
 
 
 def remap(picture: NDArray[Any], pixels: Array, interpolation: int, border: int) -> NDArray[Any]:

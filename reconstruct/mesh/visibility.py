@@ -346,8 +346,7 @@ def connected_charts(neighbours: NDArray[np.int32], label: NDArray[np.int32]) ->
     graph = coo_array(
         (np.ones(int(same.sum()), np.int8), (face[same], other[same])), (len(label), len(label))
     )
-    chart: NDArray[np.int32] = connected_components(graph, directed=False)[1].astype(np.int32)
-    return chart
+    return connected_components(graph, directed=False)[1].astype(np.int32)
 
 
 @compiled

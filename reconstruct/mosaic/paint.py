@@ -456,8 +456,7 @@ def _small_light(task: PaintTask, tools: Tools, found: _ViewOfCells, *, broad: b
 
 
 def _logarithm(light: Float32) -> Float32:
-    found: Float32 = np.log(np.maximum(light, np.float32(1e-3)))
-    return found
+    return np.log(np.maximum(light, np.float32(1e-3)))
 
 
 def _tones(task: PaintTask, tools: Tools, looks: list[_ViewOfCells], quality: Float32) -> Float32:

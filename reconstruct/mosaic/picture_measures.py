@@ -74,14 +74,12 @@ class SmallCopy:
     @property
     def detail(self) -> Float32:
         """(h, w, 3) BGR, linear light."""
-        light: Float32 = linear_table()[self.levels[..., :3]]
-        return light
+        return linear_table()[self.levels[..., :3]]
 
     @property
     def valid(self) -> Float32:
         """(h, w) share of each pixel that may be used."""
-        share: Float32 = self.levels[..., 3].astype(np.float32) / np.float32(255)
-        return share
+        return self.levels[..., 3].astype(np.float32) / np.float32(255)
 
     @property
     def whole(self) -> bool:
@@ -93,18 +91,16 @@ def linear_table() -> Float32:
     """(256,) linear light, 0 to 1, of the levels of the sRGB curve."""
     level = np.arange(256) / 255.0
     linear = np.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4)
-    table: Float32 = linear.astype(np.float32)
-    return table
+    return linear.astype(np.float32)
 
 
 def encode_srgb(light: Float32) -> Float32:
     """Levels, 0 to 255 where light is 0 to 1, by the sRGB curve; brighter light goes on beyond."""
     light = np.maximum(light, np.float32(0.0))
     curve = np.float32(1.055) * light ** np.float32(1 / 2.4) - np.float32(0.055)
-    levels: Float32 = np.float32(255.0) * np.where(
+    return np.float32(255.0) * np.where(
         light <= np.float32(0.0031308), np.float32(12.92) * light, curve
     )
-    return levels
 
 
 @small_cache()

@@ -84,8 +84,7 @@ def choose_views(
     for way, here, there in ((0, np.s_[:, :-1], np.s_[:, 1:]), (1, np.s_[:-1], np.s_[1:])):
         pair = (number[here], number[there]), (colours[here], colours[there])
         edges[here][..., way, :, :] = seam_costs(*pair)
-    chosen: NDArray[np.int32] = _trws(number, own, edges, _SWEEPS)
-    return chosen
+    return _trws(number, own, edges, _SWEEPS)
 
 
 def seam_costs(

@@ -42,8 +42,7 @@ def read_deep(path: Path) -> Deep:
         raise ImageError(
             f"{path}: levels of type {picture.dtype}: convert the picture to 8 or 16 bits"
         )
-    deep: Deep = picture
-    return deep
+    return picture
 
 
 def even_light(picture: Deep) -> NDArray[np.float32]:

@@ -38,8 +38,7 @@ def read_colour(path: Path) -> Colour:
     picture = read_pixels(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     if picture is None:
         raise ImageError(f"{path}: missing, or no picture that can be decoded")
-    colour: Colour = picture
-    return colour
+    return picture
 
 
 def read_mask(path: Path, size: tuple[int, int]) -> Mask:

@@ -80,10 +80,9 @@ class Dem(_MapRaster):
         row = np.floor((self.north - np.asarray(north, dtype=float)) / self.cell).astype(int)
         column = np.floor((np.asarray(east, dtype=float) - self.west) / self.cell).astype(int)
         inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
-        found: Array = np.where(
+        return np.where(
             inside, self.height[row.clip(0, rows - 1), column.clip(0, columns - 1)], np.nan
         )
-        return found
 
     def __repr__(self) -> str:
         rows, columns = self.height.shape
@@ -209,8 +208,7 @@ class Track(_Shown):
         """(N, 3) standard deviations of the positions."""
         if self.covariance is None:
             return None
-        sigma: Array = np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2)[:, :3])
-        return sigma
+        return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2)[:, :3])
 
     def __repr__(self) -> str:
         text = f"track: {count(len(self.images), 'picture')} in the frame '{self.frame.name}'"

@@ -271,8 +271,7 @@ class Pyramid:
         with self._open() as file:
             bands = file.read([1, 2, 3], out_shape=(3, *shape), **options)
             opacity = file.dataset_mask(out_shape=shape, **options)
-        picture: Rgba = np.dstack([*bands, np.where(opacity < _OPAQUE, 0, 255)]).astype(np.uint8)
-        return picture
+        return np.dstack([*bands, np.where(opacity < _OPAQUE, 0, 255)]).astype(np.uint8)
 
     def _window(
         self, size: Level, left: int, top: int, right: int, bottom: int

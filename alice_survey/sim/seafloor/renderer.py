@@ -172,8 +172,7 @@ def flat_floor_radiance(
         backscatter_of_row(light.backscatter, row, of_row)
         backscatter_at(of_row, light.reach_m, column, path[index], veil[index])
     received = albedo / math.pi * np.moveaxis(direct, 0, -1) + veil
-    picture: Floats = (vignetting[..., None] * received).astype(np.float32)
-    return picture
+    return (vignetting[..., None] * received).astype(np.float32)
 
 
 @lru_cache(maxsize=48)  # about 340 MB; both cameras at a quarter of the full resolution fit
@@ -207,8 +206,7 @@ def camera_rays(camera: Camera, samples: int, first_row: int, last_row: int) -> 
 def _vignetting(camera: Camera, pixels: Array) -> Array:
     """Fall of light off the axis, by a power of the cosine in air, for pixels (..., 2)."""
     in_air = camera.in_air().unproject(pixels)[1]
-    fall: Array = in_air[..., 2] ** camera.lens.falloff
-    return fall
+    return in_air[..., 2] ** camera.lens.falloff
 
 
 def ray_bands(camera: Camera, samples: int) -> list[tuple[int, int]]:

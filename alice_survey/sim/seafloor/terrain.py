@@ -186,8 +186,7 @@ class Terrain:
             a + north * (b - a) + east * (d - b),
         )
         inside = (north >= 0) & (north <= 1) & (east >= 0) & (east <= 1)
-        depth: Array = np.where(inside, local + self.offset_ned[2], np.nan)
-        return depth
+        return np.where(inside, local + self.offset_ned[2], np.nan)
 
     def _cell(self, points_ne: Array) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array]:
         """Row and column of the nearest cell, and where the point is in it (0 to 1 if inside)."""
@@ -262,8 +261,7 @@ class Terrain:
         normals /= np.linalg.norm(normals, axis=2, keepdims=True)
         top, left = rows.start - wide[0].start, columns.start - wide[1].start
         height, width = self.depths[rows, columns].shape
-        inner: Floats = normals[top : top + height, left : left + width].astype(np.float32)
-        return inner
+        return normals[top : top + height, left : left + width].astype(np.float32)
 
     def write(self, path: Path) -> None:
         """Write the mesh as binary PLY, and next to it, with suffix `.json`, what else is known.
@@ -399,8 +397,7 @@ def amphora_mesh() -> tuple[Array, NDArray[np.int32]]:
 def _resample(points: Array, count: int) -> Array:
     """Smooth (N, 2) points along their length into `count` points of even spacing."""
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-    smooth: Array = PchipInterpolator(length, points)(np.linspace(0.0, length[-1], count))
-    return smooth
+    return PchipInterpolator(length, points)(np.linspace(0.0, length[-1], count))
 
 
 def _revolve(profile: Array, around: int) -> tuple[Array, NDArray[np.int64]]:
@@ -508,8 +505,7 @@ def trough_share(sand: Array, grid_m: float) -> Array:
     """
     wide = _RIPPLE_LENGTH_M / 2.0 / grid_m
     hollow = gaussian_filter(sand, wide) - gaussian_filter(sand, wide / 4.0)
-    share: Array = np.clip(hollow / (0.3 * _RIPPLE_HEIGHT_M), 0.0, 1.0)
-    return share
+    return np.clip(hollow / (0.3 * _RIPPLE_HEIGHT_M), 0.0, 1.0)
 
 
 def scatter_rocks(
@@ -637,8 +633,7 @@ def _mounds(north_m: Array, east_m: Array, rng: np.random.Generator) -> Array:
     radius, height = rng.uniform(0.4, 0.9, count), rng.normal(0.35, 0.8, count)
     over_north = np.exp(-0.5 * ((north_m[:, None] - centre[:, 0]) / radius) ** 2)
     over_east = np.exp(-0.5 * ((east_m[:, None] - centre[:, 1]) / radius) ** 2)
-    mounds: Array = (over_north * height) @ over_east.T
-    return mounds
+    return (over_north * height) @ over_east.T
 
 
 def _ripples(north_m: Array, east_m: Array, wind_rad: float, rng: np.random.Generator) -> Array:

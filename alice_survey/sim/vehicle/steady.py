@@ -100,8 +100,7 @@ def balance_fins(vehicle: Vehicle, speed_mps: float, turn_rad_s: float = 0.0) ->
         return force
 
     def imbalance(unknown: Array) -> Array:
-        left: Array = forces(unknown)[[1, 2, 4, 5]]
-        return left
+        return forces(unknown)[[1, 2, 4, 5]]
 
     found = root(
         imbalance,

@@ -217,8 +217,7 @@ class StartPrior:
 
     def slopes(self, values: Array) -> Array:
         """Derivatives of the residuals, (P,)."""
-        slope: Array = 1.0 / (self.sigma * np.where(self.logarithmic, values, 1.0))
-        return slope
+        return 1.0 / (self.sigma * np.where(self.logarithmic, values, 1.0))
 
 
 def prior_of(
@@ -327,8 +326,7 @@ class OutputErrorFit:
     def correlation(self) -> Array:
         """(P, P) correlations; NaN of parameters at a bound."""
         sigma = self.sigma
-        matrix: Array = self.covariance / np.outer(sigma, sigma)
-        return matrix
+        return self.covariance / np.outer(sigma, sigma)
 
 
 @named_step("fit to the logs")

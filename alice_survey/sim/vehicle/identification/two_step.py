@@ -317,10 +317,8 @@ def _regressor(rows: _Rows, kind: int, force: int, motion: int) -> Array:
         return nu[:, motion]
     if kind == term.LIFT:
         first = np.abs(nu[:, 0]) if force < 3 else nu[:, 0]
-        product: Array = first * nu[:, motion]
-        return product
-    square: Array = nu[:, motion] * np.abs(nu[:, motion])
-    return square
+        return first * nu[:, motion]
+    return nu[:, motion] * np.abs(nu[:, motion])
 
 
 def _smooth(windows: Sequence[Window], parameters: Parameters) -> _Rows:

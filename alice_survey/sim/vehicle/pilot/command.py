@@ -279,8 +279,7 @@ class ThrustWatch:
 def _lasting(variance: Array, lagged: Array) -> Array:
     """Variance, (6,), of independent values that say as much as those with this covariance."""
     kept = np.clip(lagged / variance, 0.0, _MAX_MEMORY)
-    longer: Array = variance * (1.0 + kept) / (1.0 - kept)
-    return longer
+    return variance * (1.0 + kept) / (1.0 - kept)
 
 
 Without = Callable[[Mapping[str, float], Array | None], tuple[Gains, Guidance]]

@@ -115,8 +115,7 @@ def linear_damping(body: Body, nu: Array) -> Array:
     slope[2, [0, 2]] -= z_uw * np.sign(u) * w, z_uw * abs(u)
     slope[4, [0, 2]] -= m_uw * w, m_uw * u
     slope[5, [0, 1]] -= n_uv * v, n_uv * u
-    result: Array = slope
-    return result
+    return slope
 
 
 def linear_coriolis(body: Body, nu: Array) -> Array:
@@ -126,8 +125,7 @@ def linear_coriolis(body: Body, nu: Array) -> Array:
     """
     slope = coriolis_matrix(body.mass, nu)
     columns = [coriolis_matrix(body.mass, unit) @ nu for unit in np.eye(6)]
-    result: Array = slope + np.array(columns).T
-    return result
+    return slope + np.array(columns).T
 
 
 SURGE, SWAY, HEAVE, YAW, ROLL, PITCH = columns(6)
