@@ -24,7 +24,7 @@ from alice_survey.core.config import (
     parse_config,
     settings_in,
 )
-from alice_survey.core.errors import ConfigError, WorkspaceError, offer, warn
+from alice_survey.core.errors import ConfigError, WorkspaceError, file_faults, offer, warn
 from alice_survey.core.executor import Executor, local_executor
 from alice_survey.core.run import progress
 from alice_survey.core.settings_form import settings_template
@@ -257,11 +257,9 @@ def init_survey(
         strips = f" in strips of {shapes.corridor_width_m:g} m along lines (area.corridor_width_m)"
         along = strips if given_shapes(shapes).survey.lines else ""
         say(f"area: {found.datum.place}, {digits(found.survey.area)} m2{along}")
-    try:
+    with file_faults(path, WorkspaceError, "written"):
         folder.mkdir(parents=True, exist_ok=True)
         path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise WorkspaceError(f"{path}: cannot be written: {error.strerror}") from None
     return path
 
 
@@ -364,12 +362,11 @@ def only_one(workspace: Path) -> Iterator[None]:
     refuse_links(workspace, workspace / ".lock")
     lock = FileLock(workspace / ".lock", timeout=0)
     try:
-        workspace.mkdir(parents=True, exist_ok=True)
-        lock.acquire()
+        with file_faults(workspace, WorkspaceError, "written"):
+            workspace.mkdir(parents=True, exist_ok=True)
+            lock.acquire()
     except Timeout:
         raise WorkspaceError(f"another command is working in {workspace}; wait for it") from None
-    except OSError as error:
-        raise WorkspaceError(f"{workspace} cannot be written: {error.strerror}") from None
     try:
         yield
     finally:

@@ -27,7 +27,15 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic_core import to_jsonable_python
 
 from alice_survey.core.contents import MAX_TEXT, as_line, first_fault, ordinary_file
-from alice_survey.core.errors import AliceError, NavigationError, WorkspaceError, offer, warn, why
+from alice_survey.core.errors import (
+    AliceError,
+    NavigationError,
+    WorkspaceError,
+    file_faults,
+    offer,
+    warn,
+    why,
+)
 from alice_survey.core.run import progress
 from alice_survey.core.run.resources import processor, versions, watch_meter
 
@@ -593,11 +601,8 @@ def read_json(path: Path) -> Any:
         WorkspaceError: the file is missing or not JSON.
     """
     try:
-        return json.loads(ordinary_file(path).read_text(encoding="utf-8-sig"))
-    except FileNotFoundError:
-        raise WorkspaceError(f"{path}: no such file") from None
-    except OSError as error:
-        raise WorkspaceError(f"{path}: cannot be read: {why(error)}") from None
+        with file_faults(path, WorkspaceError):
+            return json.loads(ordinary_file(path).read_text(encoding="utf-8-sig"))
     except (ValueError, RecursionError) as error:
         raise WorkspaceError(f"{path}: not valid JSON: {error}") from None
 
@@ -683,7 +688,7 @@ _LOOKED_AT = 1 << 16
 
 def _cells(path: Path, *, exact: bool, fault: type[AliceError]) -> Iterator[tuple[int, list[str]]]:
     """Numbers of lines and their cells, in any encoding and with any separator that tables have."""
-    with _csv_faults(path, fault):
+    with file_faults(path, fault):
         with ordinary_file(path).open("rb") as raw:
             encoding = "utf-8-sig" if exact else _encoding_of(raw.read(_LOOKED_AT))
         with path.open(newline="", encoding=encoding) as file:
@@ -716,14 +721,6 @@ def _encoding_of(start: bytes) -> str:
     return "utf-8-sig"
 
 
-@contextlib.contextmanager
-def _csv_faults(path: Path, fault: type[AliceError]) -> Iterator[None]:
-    try:
-        yield
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise fault(f"{path}: cannot be read: {why(error)}") from None
-
-
 class StaleError(AliceError):
     """What is to be changed is no longer what was seen."""
 
@@ -734,12 +731,8 @@ def content_of(path: Path, maximum: int = MAX_TEXT) -> bytes | None:
     Raises:
         WorkspaceError: it cannot be read, or is larger than so many bytes.
     """
-    try:
-        return ordinary_file(path, maximum).read_bytes()
-    except FileNotFoundError:
-        return None
-    except OSError as error:
-        raise WorkspaceError(f"{path}: cannot be read: {error.strerror}") from None
+    with file_faults(path, WorkspaceError):
+        return ordinary_file(path, maximum).read_bytes() if path.exists() else None
 
 
 def content_token(content: bytes | None) -> str:
@@ -771,13 +764,10 @@ def replace_file(path: Path, content: bytes, check: Callable[[Path], object]) ->
     Raises:
         WorkspaceError: it cannot be written, or `check` refuses it.
     """
-    try:
-        with atomic_path(path) as temporary:
-            temporary.write_bytes(content)
-            try:
-                check(temporary)
-            except WorkspaceError as error:
-                raise WorkspaceError(str(error).replace(str(temporary), path.name)) from None
-    except OSError as error:
-        raise WorkspaceError(f"{path}: cannot be written: {error.strerror}") from None
+    with file_faults(path, WorkspaceError, "written"), atomic_path(path) as temporary:
+        temporary.write_bytes(content)
+        try:
+            check(temporary)
+        except WorkspaceError as error:
+            raise WorkspaceError(str(error).replace(str(temporary), path.name)) from None
     return content_token(content)

@@ -1,6 +1,7 @@
 """Known faults: one line that states what is wrong, with the numbers and what to change."""
 
 import contextlib
+import csv
 import errno
 import logging
 import os
@@ -167,6 +168,15 @@ def why(error: Exception) -> str:
     if isinstance(error, OSError) and error.strerror:
         return error.strerror.lower()
     return str(error)
+
+
+@contextlib.contextmanager
+def file_faults(path: Path, fault: type[AliceError], verb: str = "read") -> Iterator[None]:
+    """Raise as a known fault that a file cannot be read, or written, and why."""
+    try:
+        yield
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise fault(f"{path}: cannot be {verb}: {why(error)}") from None
 
 
 def offer(command: str, *words: object) -> str:

@@ -40,7 +40,7 @@ from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
 from alice_survey.core.artefacts import atomic_path
-from alice_survey.core.errors import ConfigError, WorkspaceError
+from alice_survey.core.errors import ConfigError, WorkspaceError, file_faults
 from alice_survey.core.frames import Array
 from alice_survey.kit.document import EAST_NORTH, Figure
 from alice_survey.kit.map import even_limit, round_length
@@ -153,12 +153,8 @@ def save_figure(sheet: Any, path: Path, dpi: float = _DPI, **options: Any) -> No
     """
     check_figure_path(path)
     content = _save_bytes(sheet, path.suffix.removeprefix(".").lower(), dpi, options)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_path(path) as temporary:
-            temporary.write_bytes(content)
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be written: {error.strerror}") from None
+    with file_faults(path, ConfigError, "written"), atomic_path(path) as temporary:
+        temporary.write_bytes(content)
 
 
 def _save_bytes(sheet: Any, kind: str, dpi: float, options: dict[str, Any]) -> bytes:

@@ -21,7 +21,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.artefacts import atomic_path
 from alice_survey.core.contents import as_line, first_fault, ordinary_file, refuse_declarations
-from alice_survey.core.errors import CalibrationError, warn
+from alice_survey.core.errors import CalibrationError, file_faults, warn
 from alice_survey.core.frames import Array
 
 _MAX_BYTES = 1 << 20
@@ -167,13 +167,8 @@ def read_bytes(path: Path, largest: int = _MAX_BYTES) -> bytes:
     Raises:
         CalibrationError: there is no such file, or it is larger.
     """
-    try:
-        with ordinary_file(path, None).open("rb") as file:
-            content = file.read(largest + 1)
-    except FileNotFoundError:
-        raise CalibrationError(f"{path}: no such file") from None
-    except OSError as error:
-        raise CalibrationError(f"{path}: cannot be read: {error.strerror}") from None
+    with file_faults(path, CalibrationError), ordinary_file(path, None).open("rb") as file:
+        content = file.read(largest + 1)
     _check_size(path, content, largest)
     return content
 

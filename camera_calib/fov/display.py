@@ -11,7 +11,7 @@ import numpy as np
 
 from alice_survey.core.artefacts import json_values, write_csv
 from alice_survey.core.config import CameraConfig, SurveyConfig, load_config, parse_config
-from alice_survey.core.errors import ConfigError, warn
+from alice_survey.core.errors import ConfigError, file_faults, warn
 from alice_survey.kit.words import field_table
 from camera_calib.formats.rigs import led_by
 from camera_calib.fov.paper import (
@@ -342,7 +342,5 @@ def _with_pixels_of(rig: Rig, camera: CameraConfig) -> CameraConfig:
 
 
 def _write(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    try:
+    with file_faults(path, ConfigError, "written"):
         write_csv(path, list(rows[0]), [list(row.values()) for row in rows])
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be written: {error.strerror}") from None

@@ -15,7 +15,7 @@ import shapely
 from shapely.geometry import MultiPolygon
 
 from alice_survey.core.contents import UNKNOWN, one_line, where_unknown
-from alice_survey.core.errors import PlanError, warn, why
+from alice_survey.core.errors import PlanError, file_faults, warn
 from alice_survey.core.frames import Array, Datum
 
 Sense = Literal["auto", "heights", "depths"]
@@ -251,11 +251,8 @@ def check_raster(path: Path) -> None:
     """
     if path.exists() and not path.is_file():
         raise PlanError(f"{path}: is not a file")
-    try:
-        with path.open("rb") as file:
-            start = file.read(_LOOKED_AT).lstrip(b"\xef\xbb\xbf \t\r\n\0")
-    except OSError as error:
-        raise PlanError(f"{path}: cannot be read as a raster: {why(error)}") from None
+    with file_faults(path, PlanError), path.open("rb") as file:
+        start = file.read(_LOOKED_AT).lstrip(b"\xef\xbb\xbf \t\r\n\0")
     if start[:1] in (b"<", b"{"):
         raise PlanError(
             f"{path}: is not a raster but a description of other files: give those, or make one "

@@ -32,7 +32,7 @@ from alice_survey.core.contents import (
     parse_number,
     xml_names,
 )
-from alice_survey.core.errors import PlanError, warn
+from alice_survey.core.errors import PlanError, file_faults, warn
 from alice_survey.kit.words import count
 from missions.areas.crs import LOCAL, geographic_shapes, parse_crs, usable_crs
 from missions.areas.raw import RawShapes, closed_as_polygons, from_geometries, from_rings
@@ -430,10 +430,8 @@ def read_bytes(path: Path) -> bytes:
         PlanError: it is missing, not a file, too large or unreadable.
     """
     check_file(path)
-    try:
+    with file_faults(path, PlanError):
         return path.read_bytes()
-    except OSError as error:
-        raise PlanError(f"area: {path}: cannot be read: {error.strerror}") from None
 
 
 def check_file(path: Path, *, may_be_empty: bool = False) -> None:

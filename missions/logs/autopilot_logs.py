@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.core.contents import one_line, ordinary_file
-from alice_survey.core.errors import NavigationError, extra, warn, why
+from alice_survey.core.errors import NavigationError, extra, file_faults, warn
 from alice_survey.core.frames import Array, Datum
 from missions.logs.dive import (
     ROLES,
@@ -764,12 +764,9 @@ def first_bytes(path: Path, count: int) -> bytes:
     Raises:
         NavigationError: it cannot be read, or is too large for one.
     """
-    try:
-        with ordinary_file(path, None).open("rb") as file:
-            size = os.fstat(file.fileno()).st_size
-            start = file.read(count)
-    except OSError as error:
-        raise NavigationError(f"{path}: cannot be read: {why(error)}") from None
+    with file_faults(path, NavigationError), ordinary_file(path, None).open("rb") as file:
+        size = os.fstat(file.fileno()).st_size
+        start = file.read(count)
     if size > MAX_LOG_BYTES:
         raise NavigationError(f"{path}: is larger than {MAX_LOG_BYTES // 10**9} GB: cut it")
     return start

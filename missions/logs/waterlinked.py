@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from alice_survey.core.contents import ordinary_file
-from alice_survey.core.errors import NavigationError
+from alice_survey.core.errors import NavigationError, file_faults
 from missions.logs.dive import LoggedDive, clean_signal, finite_number
 from missions.logs.navigation_csv import DATED_AFTER_S
 
@@ -96,15 +96,12 @@ def read_waterlinked(path: Path) -> LoggedDive:
 
 def _read_reports(path: Path) -> Iterator[dict[str, Any] | None]:
     """The report of each line, of any type; None for a line that is not a report."""
-    try:
-        with ordinary_file(path, None).open("rb") as file:
-            while line := file.readline(_MAX_LINE):
-                try:
-                    report = json.loads(line) if line.strip() else {"type": "empty line"}
-                    if report.get("format") == "json_v1":
-                        report["type"] = _VELOCITY
-                    yield report if report["type"] else None
-                except (ValueError, RecursionError, TypeError, KeyError, AttributeError):
-                    yield None
-    except OSError as error:
-        raise NavigationError(f"{path}: cannot be read: {error.strerror}") from None
+    with file_faults(path, NavigationError), ordinary_file(path, None).open("rb") as file:
+        while line := file.readline(_MAX_LINE):
+            try:
+                report = json.loads(line) if line.strip() else {"type": "empty line"}
+                if report.get("format") == "json_v1":
+                    report["type"] = _VELOCITY
+                yield report if report["type"] else None
+            except (ValueError, RecursionError, TypeError, KeyError, AttributeError):
+                yield None

@@ -26,7 +26,7 @@ from alice_survey.core.config import (
     settings_files,
     settings_in,
 )
-from alice_survey.core.errors import AliceError, ConfigError, collected_by
+from alice_survey.core.errors import AliceError, ConfigError, collected_by, file_faults
 from alice_survey.core.frames import Array, Datum
 from alice_survey.core.settings_text import Values, with_settings_changed, with_values
 from camera_calib.rig import Rig, design_rig
@@ -166,11 +166,8 @@ def _check_files(changes: Values, before: Mapping[str, Any], folder: Path) -> No
 
 
 def _write(path: Path, text: str) -> None:
-    try:
-        with atomic_path(path) as temporary:
-            temporary.write_bytes(text.encode("utf-8"))
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be written: {error.strerror}") from None
+    with file_faults(path, ConfigError, "written"), atomic_path(path) as temporary:
+        temporary.write_bytes(text.encode("utf-8"))
 
 
 def preview(config: SurveyConfig) -> dict[str, Any]:

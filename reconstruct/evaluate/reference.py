@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from alice_survey.core.artefacts import need_stage, refuse_links
 from alice_survey.core.contents import one_line, where_unknown
-from alice_survey.core.errors import ReconstructionError, WorkspaceError, why
+from alice_survey.core.errors import ReconstructionError, WorkspaceError, file_faults
 from alice_survey.core.executor import run_apart
 from alice_survey.core.frames import Array, Datum
 from alice_survey.core.records import ReferenceRecord, RegistrationRecord
@@ -227,10 +227,8 @@ def read_own_cloud(workspace: Path) -> Array:
         ReconstructionError: it is empty.
     """
     cloud = need_stage(workspace, "dense", "reconstruct") / "cloud.ply"
-    try:
+    with file_faults(cloud, WorkspaceError):
         points = read_ply_points(cloud, _MAX_POINTS)
-    except (OSError, ValueError) as error:
-        raise WorkspaceError(f"{cloud}: cannot be read: {why(error)}") from None
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) < 100:
         raise ReconstructionError(f"{cloud}: holds {len(points)} points")

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.core.contents import as_line, is_nowhere, is_unknown, ordinary_file
-from alice_survey.core.errors import ImageError, why
+from alice_survey.core.errors import ImageError, file_faults
 from camera_calib import picture_files
 
 HEIC = (".heic", ".heif", ".hif", ".avif")
@@ -101,7 +101,7 @@ def look_into(
     """
     known = {path.resolve() for path in apart}
     inside: list[Path] = []
-    try:
+    with file_faults(folder, ImageError):
         for top, folders, names in os.walk(folder, onerror=_raise):
             for some in (folders, names):
                 some[:] = [
@@ -109,8 +109,6 @@ def look_into(
                     if not name.startswith(".") and Path(top, name).resolve() not in known
                 ]  # fmt: skip
             inside += [Path(top, name) for name in names]
-    except OSError as error:
-        raise ImageError(f"{folder}: cannot be read: {why(error)}") from None
     inside.sort(key=lambda p: [(natural_key(part), part) for part in p.relative_to(folder).parts])
     of_masks = {
         (path.parent, name) for path in inside if kind_of(path) for name in mask_names(path.name)

@@ -26,8 +26,8 @@ from alice_survey.core.errors import (
     ImageError,
     PlanError,
     WorkspaceError,
+    file_faults,
     keep_warnings,
-    why,
 )
 from alice_survey.core.executor import SERIAL, Executor
 from alice_survey.core.manifest import ImageRecord, read_manifest, write_manifest
@@ -393,7 +393,7 @@ def cameras_in(folder: Path) -> dict[str, Path]:
         Folders by name, in order; empty where there are not 2 to 8 of them, where the folder
         holds pictures of its own, or where their numbers differ.
     """
-    try:
+    with file_faults(folder, ImageError):
         inside = sorted(p for p in folder.iterdir() if not p.name.startswith("."))
         if any(path.is_file() and files.kind_of(path) for path in inside):
             return {}
@@ -402,8 +402,6 @@ def cameras_in(folder: Path) -> dict[str, Path]:
             for path in inside
             if path.is_dir() and not path.is_symlink()
         }
-    except OSError as error:
-        raise ImageError(f"{folder}: cannot be read: {why(error)}") from None
     counts = {name: count for name, count in counts.items() if count}
     if not 2 <= len(counts) <= _MAX_CAMERAS:
         return {}

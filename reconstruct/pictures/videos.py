@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.core.contents import ordinary_file
-from alice_survey.core.errors import ImageError, note, warn
+from alice_survey.core.errors import ImageError, file_faults, note, warn
 from alice_survey.core.executor import progress
 from alice_survey.core.frames import Array
 from reconstruct.pictures.files import VIDEO, PictureFacts, natural_key, safe_name, to_utc
@@ -290,11 +290,8 @@ def video_start(path: Path) -> tuple[datetime | None, str]:
     Raises:
         ImageError: the file cannot be read.
     """
-    try:
-        with ordinary_file(path, None).open("rb") as file:
-            index = _index_of(file, file.seek(0, os.SEEK_END))
-    except OSError as error:
-        raise ImageError(f"{path}: cannot be read: {error.strerror}") from None
+    with file_faults(path, ImageError), ordinary_file(path, None).open("rb") as file:
+        index = _index_of(file, file.seek(0, os.SEEK_END))
     at = index.find(b"mvhd") + 4
     form = ">Q" if index[at : at + 1] == b"\1" else ">I"
     if at < 4 or len(index) < at + 4 + struct.calcsize(form):

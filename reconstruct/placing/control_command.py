@@ -30,7 +30,7 @@ import numpy as np
 
 from alice_survey.core.artefacts import need_stage, write_csv
 from alice_survey.core.contents import as_line, one_line, ordinary_file, xml_root
-from alice_survey.core.errors import ReconstructionError, WorkspaceError, warn, why
+from alice_survey.core.errors import ReconstructionError, WorkspaceError, file_faults, warn
 from alice_survey.core.executor import SERIAL, Executor
 from alice_survey.core.frames import SYSTEM, Array, distances_m
 from alice_survey.core.manifest import ImageRecord, read_manifest
@@ -556,10 +556,8 @@ def read_foreign(path: Path) -> ForeignControl:
     Raises:
         WorkspaceError: it cannot be read or is of none.
     """
-    try:
+    with file_faults(path, WorkspaceError):
         text = ordinary_file(path, _MAX_BYTES).read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise WorkspaceError(f"{path}: cannot be read: {why(error)}") from None
     if text.lstrip().startswith("<") and "<markers" in text:
         read = read_markers
     elif SYSTEM.match(text):

@@ -53,7 +53,7 @@ from alice_survey.core.artefacts import (
     write_csv,
 )
 from alice_survey.core.contents import as_line, is_nowhere, is_unknown, parse_number
-from alice_survey.core.errors import WorkspaceError, warn, why
+from alice_survey.core.errors import WorkspaceError, file_faults, warn
 from alice_survey.core.frames import Array, Datum, degrees_from
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from camera_calib.triangulate import nearest_to_rays
@@ -485,7 +485,7 @@ def _records(path: Path, content: bytes) -> tuple[str, list[tuple[str, list[str]
 
     A record is its text as it stands in the file, with the end of its line, and its cells.
     """
-    try:
+    with file_faults(path, WorkspaceError):
         text = content.decode("utf-8")
         mark = "\ufeff" if text.startswith("\ufeff") else ""
         lines = io.StringIO(text.removeprefix(mark), newline="").readlines()
@@ -493,8 +493,6 @@ def _records(path: Path, content: bytes) -> tuple[str, list[tuple[str, list[str]
         for cells in reader:
             records.append(("".join(lines[at : reader.line_num]), cells))
             at = reader.line_num
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise WorkspaceError(f"{path}: cannot be read: {why(error)}") from None
     return mark, records, "\r\n" if records and records[0][0].endswith("\r\n") else "\n"
 
 

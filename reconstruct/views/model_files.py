@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.compiled import compiled
-from alice_survey.core.errors import ReconstructionError
+from alice_survey.core.errors import ReconstructionError, file_faults
 from alice_survey.core.frames import Array
 from camera_calib.approximation.pinhole_warp import Pinhole
 
@@ -234,10 +234,8 @@ def _map_file(path: Path) -> Content:
 
 def _check(path: Path, length: Callable[[Content, int], int]) -> None:
     """Follow a file's counts to its end."""
-    try:
+    with file_faults(path, ReconstructionError):
         content = _map_file(path)
-    except OSError as error:
-        raise ReconstructionError(f"{path}: cannot be read: {error.strerror}") from None
     at = 8
     try:
         (count,) = struct.unpack_from("<Q", content)

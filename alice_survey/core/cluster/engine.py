@@ -28,7 +28,16 @@ from alice_survey.core.artefacts import refuse_links
 from alice_survey.core.cluster.worker import Answer, RunSite, code_and_versions, run_task, why_unfit
 from alice_survey.core.config import Config
 from alice_survey.core.contents import first_fault, ordinary_file, parse_toml
-from alice_survey.core.errors import AliceError, ConfigError, WorkspaceError, extra, note, warn, why
+from alice_survey.core.errors import (
+    AliceError,
+    ConfigError,
+    WorkspaceError,
+    extra,
+    file_faults,
+    note,
+    warn,
+    why,
+)
 from alice_survey.core.executor import Executor, Item, Result, TaskResult, default_threads, in_order
 from alice_survey.core.run import progress
 from alice_survey.core.run.resources import count_elsewhere
@@ -81,13 +90,12 @@ def read_cluster_file(path: Path) -> ClusterConfig:
     """
     if path.suffix.lower() == ".json":
         return ClusterConfig(scheduler_file=path)
-    try:
+    with file_faults(path, ConfigError):
         text = ordinary_file(path).read_text(encoding="utf-8")
+    try:
         return ClusterConfig.model_validate(parse_toml(text))
     except ValidationError as error:
         raise ConfigError(f"{path}: {first_fault(error)}") from None
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {why(error)}") from None
     except (ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: not valid TOML: {error}") from None
 
@@ -186,7 +194,7 @@ def _store(workspace: Path) -> Iterator[Path]:
     refuse_links(workspace, workspace / STORE)
     folder = (workspace / STORE).resolve() / os.urandom(6).hex()
     lock = FileLock(folder.with_suffix(_LOCK), timeout=0)
-    try:
+    with file_faults(workspace, WorkspaceError, "written"):
         folder.parent.mkdir(parents=True, exist_ok=True)
         for left in folder.parent.glob(f"*{_LOCK}"):
             with contextlib.suppress(Timeout), FileLock(left, timeout=0):
@@ -195,8 +203,6 @@ def _store(workspace: Path) -> Iterator[Path]:
         lock.acquire()
         folder.mkdir()
         (folder / "mark").write_text(folder.name)
-    except OSError as error:
-        raise WorkspaceError(f"{workspace} cannot be written: {why(error)}") from None
     try:
         yield folder
     finally:

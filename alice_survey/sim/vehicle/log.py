@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from alice_survey.core.artefacts import write_csv
 from alice_survey.core.config import Config
 from alice_survey.core.contents import as_line, ordinary_file, parse_number
-from alice_survey.core.errors import VehicleError, warn, why
+from alice_survey.core.errors import VehicleError, file_faults, warn
 from alice_survey.core.frames import Array, attitude_from_rotation, rotation_from_attitude
 from alice_survey.sim.vehicle.vehicle import parse_table, read_table
 
@@ -184,13 +184,13 @@ def read_number_columns(path: Path) -> dict[str, Array]:
         VehicleError: the file cannot be read, is not a table, has no rows, or a column of numbers
             holds something else in a line.
     """
-    try:
-        with ordinary_file(path).open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.reader(file)
-            names = [name.strip() for name in next(reader, [])]
-            rows = [(reader.line_num, row) for row in reader if row]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise VehicleError(f"{path}: cannot be read: {why(error)}") from None
+    with (
+        file_faults(path, VehicleError),
+        ordinary_file(path).open(newline="", encoding="utf-8-sig") as file,
+    ):
+        reader = csv.reader(file)
+        names = [name.strip() for name in next(reader, [])]
+        rows = [(reader.line_num, row) for row in reader if row]
     if not rows:
         raise VehicleError(f"{path}: has no rows")
     twice = next((name for name in names if names.count(name) > 1), None)

@@ -25,7 +25,7 @@ from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError
 from alice_survey.core.artefacts import write_json
 from alice_survey.core.config import VEHICLE_FILES, Config
 from alice_survey.core.contents import as_line, one_line, ordinary_file, parse_toml
-from alice_survey.core.errors import VehicleError, why
+from alice_survey.core.errors import VehicleError, file_faults
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.coefficients import (
     CALIBRATED,
@@ -476,10 +476,8 @@ def read_table(path: Path) -> dict[str, Any]:
 
 
 def _text_of(path: Path) -> str:
-    try:
+    with file_faults(path, VehicleError):
         return ordinary_file(path).read_text(encoding="utf-8")
-    except (OSError, ValueError) as error:
-        raise VehicleError(f"{path}: cannot be read: {as_line(why(error))}") from None
 
 
 def _table_of(path: Path, text: str) -> dict[str, Any]:
