@@ -1,8 +1,7 @@
 """Thrust allocation: which thrusters make a wrench.
 
-Both solvers take the matrix B (6, n) of `Vehicle.configuration_matrix`, the requested wrench (6,),
-the bounds of thrust (n,), the weights of axes (6,) and of thrusters (n,), and write the thrust
-(n,):
+Both solvers take the requested wrench (6,) and an `Allocation`: the matrix B (6, n), the bounds of
+thrust (n,), the weights of axes (6,) and of thrusters (n,); they write its thrust (n,):
 
 - `allocate_exact`: the least weighted residual within the bounds and, of all ways to it, the least
   weighted thrust;
@@ -61,6 +60,33 @@ def allocation_scratch(thrusters: int) -> AllocationScratch:
     )
 
 
+class Allocation(NamedTuple):
+    """Settings of the allocation from wrench to n thrusts and m angles of fins."""
+
+    exact: bool
+    propulsion: Propulsion
+    """Propulsion as the allocation assumes it."""
+    fins: Fins
+    matrix: Array
+    """B, (6, n + m): of the thrusters; and of the fins, per angle, at the speed of the tick."""
+    axes: Array
+    """(6,) weight of each axis; 0 of one that is not requested."""
+    health: Array
+    """(n,) 1 of an intact thruster, 0 of a failed one, see `weakened`."""
+    lower: Array
+    upper: Array
+    """(n + m,) N, and rad; the same of a thruster that has failed."""
+    weights: Array
+    """(n + m,) positive; the cost is the sum of weight times thrust squared."""
+    thrust: Array
+    """(n + m,) thrusts, and angles of fins."""
+    command: Array
+    """(n + m,) speeds, and angles of fins."""
+    known: Array
+    """(6,) velocity that thrusters are believed to meet."""
+    scratch: AllocationScratch
+
+
 AXIS_WEIGHTS: Array = np.array([1.0, 3.0, 30.0, 0.0, 0.0, 10.0])
 """Priorities when not all is attainable. Heave keeps the vehicle off the sea floor; yaw keeps
 the pictures square and the thrusters pointing where the controller thinks they point; sway keeps to
@@ -102,53 +128,32 @@ _SLOPE = 1e-12
 
 
 @kernel
-def allocate_exact(
-    matrix: Array,
-    wrench: Array,
-    lower: Array,
-    upper: Array,
-    axes: Array,
-    weights: Array,
-    thrust: Array,
-    scratch: AllocationScratch,
-) -> int:
+def allocate_exact(wrench: Array, allocation: Allocation) -> int:
     """Allocate a wrench with the least residual and, of all ways to it, the least thrust.
 
     Args:
-        matrix: (6, n) B, wrench per thrust.
         wrench: (6,) requested, N and N m.
-        lower: (n,) least thrust, N.
-        upper: (n,) greatest thrust, N; the same as `lower` of a thruster that has failed.
-        axes: (6,) weights of the axes' residuals; 0 of an axis that is not requested.
-        weights: (n,) positive; the cost is the sum of weight times thrust squared.
-        thrust: (n,) is written, N.
-        scratch: work arrays.
+        allocation: its matrix, bounds and weights; its thrust is written.
 
     Returns:
         Number of least-squares problems solved; negative if that many were not enough, with
         `thrust` within the bounds but perhaps not the best.
     """
-    n = matrix.shape[1]
-    m = _pose(matrix, wrench, lower, upper, axes, weights, scratch)
+    n, scratch = allocation.matrix.shape[1], allocation.scratch
+    m = _pose(wrench, allocation)
     limit = 10 * n + 10
     solved = _min_residual(m, n, scratch, limit)
     if solved > 1:
         solved = _min_norm(m, n, scratch, solved, limit)
-    _write_thrust(lower, upper, thrust, scratch)
+    _write_thrust(allocation)
     return solved
 
 
 @kernel
-def _pose(
-    matrix: Array,
-    wrench: Array,
-    lower: Array,
-    upper: Array,
-    axes: Array,
-    weights: Array,
-    scratch: AllocationScratch,
-) -> int:
+def _pose(wrench: Array, allocation: Allocation) -> int:
     """Write the problem for x = W_f f, with x as near to 0 as the bounds allow; return its rows."""
+    matrix, axes, scratch = allocation.matrix, allocation.axes, allocation.scratch
+    lower, upper, weights = allocation.lower, allocation.upper, allocation.weights
     n, m = matrix.shape[1], 0
     a, state, v = scratch.matrices[0], scratch.states, scratch.vectors
     x, b, low, high, scale = v[_X], v[_B], v[_LOW], v[_HIGH], v[_SCALE]
@@ -167,9 +172,10 @@ def _pose(
 
 
 @kernel
-def _write_thrust(lower: Array, upper: Array, thrust: Array, scratch: AllocationScratch) -> None:
+def _write_thrust(allocation: Allocation) -> None:
     """Write the thrusts, (n,), that x stands for."""
-    x, scale = scratch.vectors[_X], scratch.vectors[_SCALE]
+    lower, upper, thrust = allocation.lower, allocation.upper, allocation.thrust
+    x, scale = allocation.scratch.vectors[_X], allocation.scratch.vectors[_SCALE]
     for i in range(thrust.shape[0]):
         thrust[i] = min(max(x[i] * scale[i], lower[i]), upper[i])
 
@@ -395,16 +401,7 @@ def _pseudo_solve(m: int, n: int, right: Array, out: Array, scratch: AllocationS
 
 
 @kernel
-def allocate_rpi(
-    matrix: Array,
-    wrench: Array,
-    lower: Array,
-    upper: Array,
-    axes: Array,
-    weights: Array,
-    thrust: Array,
-    scratch: AllocationScratch,
-) -> int:
+def allocate_rpi(wrench: Array, allocation: Allocation) -> int:
     """Allocate a wrench by the redistributed pseudo-inverse.
 
     Each round solves for the thrusters that are not saturated, holds those that came out beyond
@@ -418,8 +415,8 @@ def allocate_rpi(
     Returns:
         Number of solutions computed.
     """
-    n, rounds, again = matrix.shape[1], 0, True
-    m = _pose(matrix, wrench, lower, upper, axes, weights, scratch)
+    n, rounds, again = allocation.matrix.shape[1], 0, True
+    m, scratch = _pose(wrench, allocation), allocation.scratch
     a, state, v = scratch.matrices[0], scratch.states, scratch.vectors
     x, b, low, high, step, rest = v[_X], v[_B], v[_LOW], v[_HIGH], v[_STEP], v[_REST]
     while again:
@@ -435,34 +432,8 @@ def allocate_rpi(
                 x[i] = min(max(step[i], low[i]), high[i])
                 if x[i] != step[i]:
                     state[i], again = _FIXED, True
-    _write_thrust(lower, upper, thrust, scratch)
+    _write_thrust(allocation)
     return rounds
-
-
-class Allocation(NamedTuple):
-    """Settings of the allocation from wrench to n thrusts and m angles of fins."""
-
-    exact: bool
-    propulsion: Propulsion
-    """Propulsion as the allocation assumes it."""
-    fins: Fins
-    matrix: Array
-    """B, (6, n + m): of the thrusters; and of the fins, per angle, at the speed of the tick."""
-    axes: Array
-    """(6,) weight of each axis; 0 of one that is not requested."""
-    health: Array
-    """(n,) 1 of an intact thruster, 0 of a failed one, see `weakened`."""
-    lower: Array
-    upper: Array
-    """(n + m,) N, and rad."""
-    weights: Array
-    thrust: Array
-    """(n + m,) thrusts, and angles of fins."""
-    command: Array
-    """(n + m,) speeds, and angles of fins."""
-    known: Array
-    """(6,) velocity that thrusters are believed to meet."""
-    scratch: AllocationScratch
 
 
 def new_allocation(vehicle: Vehicle, health: Array, *, exact: bool, axes: Array) -> Allocation:
@@ -498,21 +469,16 @@ def allocate(wrench: Array, nu: Array, allocation: Allocation) -> None:
     known = allocation.known
     for i in range(6):
         known[i] = nu[i] if math.isfinite(nu[i]) else 0.0
-    lower, upper = allocation.lower, allocation.upper
-    thrust_limits(allocation.propulsion, allocation.health, known, lower, upper)
+    thrust_limits(
+        allocation.propulsion, allocation.health, known, allocation.lower, allocation.upper
+    )
     preference_weights(allocation.propulsion, known[0], allocation.weights)
     thrusters = allocation.propulsion.table.shape[0]
     write_fin_matrix(allocation.fins, known, allocation.matrix, thrusters)
     if allocation.exact:
-        allocate_exact(
-            allocation.matrix, wrench, lower, upper,
-            allocation.axes, allocation.weights, allocation.thrust, allocation.scratch,
-        )  # fmt: skip
+        allocate_exact(wrench, allocation)
     else:
-        allocate_rpi(
-            allocation.matrix, wrench, lower, upper,
-            allocation.axes, allocation.weights, allocation.thrust, allocation.scratch,
-        )  # fmt: skip
+        allocate_rpi(wrench, allocation)
     speeds_for(allocation.propulsion, allocation.thrust, known, allocation.command)
     for i in range(thrusters, allocation.thrust.shape[0]):
         allocation.command[i] = allocation.thrust[i]

@@ -39,9 +39,11 @@ def solve(
     thrust = np.full(count, np.nan)
     chosen = np.ones(count) if weights is None else weights
     assert callable(solver)
-    solved = solver(
-        matrix, wanted, lower, upper, axes, chosen, thrust, allocation.allocation_scratch(count)
-    )
+    posed = allocation.Allocation(
+        True, ALICE.plant.propulsion, ALICE.plant.fins, matrix, axes, np.ones(count), lower, upper,
+        chosen, thrust, thrust, REST, allocation.allocation_scratch(count),
+    )  # fmt: skip
+    solved = solver(wanted, posed)
     assert solved > 0
     assert np.all((thrust >= lower) & (thrust <= upper))
     return thrust
