@@ -68,8 +68,7 @@ class Covariance:
         """(P, P); rows of a parameter without variance are 0."""
         sigma = np.sqrt(np.diag(self.matrix))
         scale = np.divide(1.0, sigma, out=np.zeros_like(sigma), where=sigma > 0)
-        correlation: Array = self.matrix * np.outer(scale, scale)
-        return correlation
+        return np.asarray(self.matrix * np.outer(scale, scale))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -58,8 +58,7 @@ class TargetShape:
         """(N, 3), or 0 without modes, points minus the drawing."""
         if not self.parameters:
             return np.zeros(3)
-        offsets: Array = np.einsum("k,kni->ni", self.values, self.modes)
-        return offsets
+        return np.asarray(np.einsum("k,kni->ni", self.values, self.modes))
 
     @property
     def sigmas(self) -> dict[str, float]:

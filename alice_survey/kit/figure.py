@@ -271,8 +271,7 @@ def palette_colours(name: str, shares: Array) -> NDArray[np.uint8]:
     Returns:
         (..., 4) red, green, blue and opacity, 0 to 255.
     """
-    colours: NDArray[np.uint8] = (255 * mpl.colormaps[name](shares)).astype(np.uint8)
-    return colours
+    return np.asarray((255 * mpl.colormaps[name](shares)).astype(np.uint8))
 
 
 def palette_steps(name: str, count: int) -> list[str]:

@@ -236,8 +236,7 @@ def residual_px(warp: PinholeWarp, depths_m: Array) -> Array:
     """
     pixels = warp.camera.frame_grid(_GRID, _GRID)
     residuals = [warp.to_pinhole(pixels, d) - warp.to_pinhole(pixels) for d in depths_m]
-    lengths: Array = np.linalg.norm(np.stack(residuals), axis=-1)
-    return lengths
+    return np.asarray(np.linalg.norm(np.stack(residuals), axis=-1))
 
 
 def _lines(camera: Camera, taken: Array, centre_m: Array) -> tuple[Array, Array]:

@@ -437,8 +437,7 @@ def _blur(adjusted: Adjustment) -> Array:
     if chance < _BY_CHANCE:
         return np.ones_like(share)
     drawn = (count * share + _DRAWN) / (count + _DRAWN)
-    blur: Array = np.clip(np.sqrt(drawn), 1.0 / _DULLEST, _DULLEST)
-    return blur
+    return np.asarray(np.clip(np.sqrt(drawn), 1.0 / _DULLEST, _DULLEST))
 
 
 def _views_of(

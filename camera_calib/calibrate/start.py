@@ -263,5 +263,4 @@ def poses_apart(poses: RigidTransform, scale: float) -> Array:
     turns = poses.rotation.as_matrix()
     cosines = (np.einsum("aij,bij->ab", turns, turns) - 1.0) / 2.0
     places = np.linalg.norm(poses.translation[:, None] - poses.translation, axis=-1)
-    apart: Array = np.arccos(np.clip(cosines, -1.0, 1.0)) + places / scale
-    return apart
+    return np.asarray(np.arccos(np.clip(cosines, -1.0, 1.0)) + places / scale)

@@ -320,8 +320,7 @@ def _pixel_sizes_mm(camera: Camera, pixels: Array, floor_z: float) -> Array:
     square = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
     x, y = np.moveaxis(camera.at_depth(pixels[:, None] + square, floor_z)[..., :2], -1, 0)
     doubled = (x * np.roll(y, -1, axis=1) - y * np.roll(x, -1, axis=1)).sum(axis=1)
-    sizes: Array = np.sqrt(np.abs(doubled) / 2) * 1e3
-    return sizes
+    return np.asarray(np.sqrt(np.abs(doubled) / 2) * 1e3)
 
 
 def _widest_deg(corner_rays: Array) -> float:

@@ -44,8 +44,7 @@ _OUTER_SHARE = 0.7
 def within_gate(residuals_px: Array, noise_px: Array | float) -> NDArray[np.bool_]:
     """Which residuals (..., 2) are known and not outliers, by the noise (...) of a coordinate."""
     squared = (residuals_px**2).sum(axis=-1)
-    known: NDArray[np.bool_] = squared <= (GATE_SIGMAS * noise_px) ** 2
-    return known
+    return np.asarray(squared <= (GATE_SIGMAS * noise_px) ** 2)
 
 
 def rms_length_px(residuals_px: Array, noise_px: Array | float) -> float:
@@ -121,16 +120,14 @@ def outward(camera: Camera, pixels: Array) -> Array:
     """Unit vectors (..., 2) from the principal point to pixels (..., 2); 0 at that point."""
     away = pixels - np.array([camera.cx_px, camera.cy_px])
     length = np.linalg.norm(away, axis=-1, keepdims=True)
-    unit: Array = np.divide(away, length, out=np.zeros_like(away), where=length > 0)
-    return unit
+    return np.asarray(np.divide(away, length, out=np.zeros_like(away), where=length > 0))
 
 
 def incidence_deg(camera: Camera, pixels: Array) -> Array:
     """(...,) angles between the rays in water and the port's normal, degrees."""
     points, directions = camera.unproject(pixels)
     normals = camera.port.clearance(points.reshape(-1, 3))[1].reshape(points.shape)
-    angles: Array = np.degrees(np.arccos(np.clip((directions * normals).sum(axis=-1), -1, 1)))
-    return angles
+    return np.asarray(np.degrees(np.arccos(np.clip((directions * normals).sum(axis=-1), -1, 1))))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -328,8 +325,7 @@ def _plane_coordinates(points: Array) -> Array:
     """(N, 2) in the points' own plane, about their centre, at most about 1 in size."""
     centred = points - points.mean(axis=0)
     axes = np.linalg.svd(centred, full_matrices=False)[2][:2]
-    flat: Array = centred @ axes.T / np.abs(centred @ axes.T).max()
-    return flat
+    return np.asarray(centred @ axes.T / np.abs(centred @ axes.T).max())
 
 
 def _map(h: Array, plane: Array) -> tuple[Array, Array]:

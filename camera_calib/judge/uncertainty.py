@@ -128,8 +128,7 @@ def frame_points(camera: Camera, ranges_m: tuple[float, ...]) -> Array:
     """Points over the frame at some distances, (N, 3) in the camera's frame."""
     pixels = camera.frame_grid(9, 9).reshape(-1, 2)
     points = np.concatenate([camera.at_depth(pixels, r) for r in ranges_m])
-    kept: Array = points[np.isfinite(points).all(axis=1)]
-    return kept
+    return np.asarray(points[np.isfinite(points).all(axis=1)])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -205,8 +204,7 @@ def _triangulation(rig: Rig, points_rig: Array) -> tuple[Array, Array]:
 def _sigmas(rig: Rig, slopes: Array) -> Array:
     """Standard deviations (...) of what follows the rig's parameters by slopes (..., P)."""
     variance = np.einsum("...p,pq,...q->...", slopes, covariance_of(rig).matrix, slopes)
-    sigmas: Array = np.sqrt(np.maximum(variance, 0.0))
-    return sigmas
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
 
 def point_sigmas_m(rig: Rig, points_rig: Array) -> Array:
@@ -239,8 +237,7 @@ def shape_sigmas_m(rig: Rig, points_rig: Array) -> Array:
 def noise_sigmas_m(rig: Rig, points_rig: Array, noise_px: float) -> Array:
     """Standard deviations (N, 3) of triangulated points by the noise of one pixel coordinate."""
     _, gain = _triangulation(rig, points_rig)
-    sigmas: Array = noise_px * np.sqrt((gain**2).sum(axis=-1))
-    return sigmas
+    return np.asarray(noise_px * np.sqrt((gain**2).sum(axis=-1)))
 
 
 def length_sigmas_m(rig: Rig, starts_rig: Array, ends_rig: Array) -> Array:

@@ -198,8 +198,7 @@ def _knit(known: Places) -> Places:
 
 def _alternating(places: NDArray[np.int_]) -> Array:
     """1 and -1 in turn, as the colours of a chessboard's corners."""
-    signs: Array = 1.0 - 2.0 * (places.sum(axis=1) % 2)
-    return signs
+    return np.asarray(1.0 - 2.0 * (places.sum(axis=1) % 2))
 
 
 def _next_to(picture: NDArray[np.uint8], known: Places, tries: Counter[Place]) -> Places:

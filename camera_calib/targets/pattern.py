@@ -125,8 +125,7 @@ def marker_bits(dictionary: str, number: int, border: int) -> Bits:
     known = aruco_dictionary(dictionary)
     side = known.markerSize + 2 * border
     picture = cv2.aruco.generateImageMarker(known, number, side, borderBits=border)
-    black: Bits = picture == 0
-    return black
+    return np.asarray(picture == 0)
 
 
 def _bit_rectangles(black: Bits, place: Array, side_m: float) -> Array:
@@ -136,5 +135,4 @@ def _bit_rectangles(black: Bits, place: Array, side_m: float) -> Array:
     for j, row in enumerate(black):
         edges = np.flatnonzero(np.diff(np.concatenate([[0], row.astype(int), [0]])))
         rows += [(a, j, b, j + 1) for a, b in edges.reshape(-1, 2)]
-    rectangles: Array = np.array(rows, dtype=np.float64).reshape(-1, 4) * bit + np.tile(place, 2)
-    return rectangles
+    return np.asarray(np.array(rows, dtype=np.float64).reshape(-1, 4) * bit + np.tile(place, 2))

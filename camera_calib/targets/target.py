@@ -165,8 +165,7 @@ class Target:
         """(N,) whether the area above and left of a point is black; it is opposite below it."""
         rows, columns = self.shape
         y, x = np.mgrid[:rows, :columns]
-        black: NDArray[np.bool_] = ((x + y + self.first_square_white) % 2 == 0).ravel()
-        return black
+        return np.asarray(((x + y + self.first_square_white) % 2 == 0).ravel())
 
     @property
     def first_square_white(self) -> bool:

@@ -245,5 +245,4 @@ def _distance_m(lat_lon: Array, datum: Datum) -> Array:
         np.sin((lat - lat_0) / 2) ** 2
         + np.cos(lat) * math.cos(lat_0) * np.sin((lon - lon_0) / 2) ** 2
     )
-    distance: Array = 2 * radius_m * np.arcsin(np.sqrt(np.clip(haversine, 0.0, 1.0)))
-    return distance
+    return np.asarray(2 * radius_m * np.arcsin(np.sqrt(np.clip(haversine, 0.0, 1.0))))

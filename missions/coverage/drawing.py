@@ -117,8 +117,7 @@ def _between(corners: Array, rows: int, columns: int) -> Array:
     right = ((np.arange(columns) + 0.5) / columns)[None, :, None]
     top = corners[0, 0] * (1 - right) + corners[0, 1] * right
     bottom = corners[1, 0] * (1 - right) + corners[1, 1] * right
-    places: Array = top * (1 - down) + bottom * down
-    return places
+    return np.asarray(top * (1 - down) + bottom * down)
 
 
 _AREA, _HOLE, _TRACK = "#17202a", "#c0392b", "#17202a"

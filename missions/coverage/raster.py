@@ -55,8 +55,7 @@ class Grid:
 
     def cells_of(self, points_ne: Array) -> Array:
         """Row and column, (..., 2), of places (..., 2); the middle of a cell is at a half."""
-        cells: Array = (points_ne - np.array(self.origin_ne)) @ self.axes.T / self.cell_m
-        return cells
+        return np.asarray((points_ne - np.array(self.origin_ne)) @ self.axes.T / self.cell_m)
 
     def places_of(self, cells: Array) -> Array:
         """The inverse of `cells_of`."""
@@ -182,8 +181,7 @@ def footprints_ne(
     height = altitude_m[:, None, None] - points[..., 2]
     reach = np.full(height.shape, np.nan)
     np.divide(height, rays[..., 2], out=reach, where=(rays[..., 2] > 0.0) & (height > 0.0))
-    borders: Array = glass_ne[:, None, None] + points[..., :2] + reach[..., None] * rays[..., :2]
-    return borders
+    return np.asarray(glass_ne[:, None, None] + points[..., :2] + reach[..., None] * rays[..., :2])
 
 
 def footprint_offsets(

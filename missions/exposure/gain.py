@@ -207,8 +207,7 @@ def read_linear(file: Path, *, linear: bool) -> Floats | None:
     stacked = raw[:, :, None] if raw.ndim == 2 else raw[:, :, :3]
     shares = np.minimum(np.arange(int(np.iinfo(raw.dtype).max) + 1) / full, 1.0)
     table = shares if linear else _from_srgb(shares)
-    picture: Floats = table.astype(np.float32)[stacked]
-    return picture
+    return np.asarray(table.astype(np.float32)[stacked])
 
 
 def _from_srgb(encoded: Array) -> Array:

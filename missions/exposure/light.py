@@ -234,8 +234,7 @@ def lens_falloff(rig: Rig, pixels: Array) -> Array:
     """cos^4 of the angle in air between the axis and the rays of pixels (..., 2)."""
     camera = rig.cameras[rig.reference]
     offset = (pixels - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px]
-    fall: Array = 1.0 / (1.0 + (offset**2).sum(axis=-1)) ** 2
-    return fall
+    return np.asarray(1.0 / (1.0 + (offset**2).sum(axis=-1)) ** 2)
 
 
 def light_budget(

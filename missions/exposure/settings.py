@@ -135,8 +135,7 @@ def blur_rates(rig: Rig, plan: PlanConfig, altitude_m: float) -> BlurRates:
     rates = np.diag([about, about, math.radians(plan.yaw_rate_deg_s)])
 
     def on_sensor(velocity_body: Array) -> Array:
-        pixels_per_s: Array = np.einsum("nij,nj->ni", slopes, cam_from_body.apply(velocity_body))
-        return pixels_per_s
+        return np.asarray(np.einsum("nij,nj->ni", slopes, cam_from_body.apply(velocity_body)))
 
     forward = on_sensor(np.tile([-plan.speed_mps, 0.0, 0.0], (len(pixels), 1)))
     turning = np.stack([on_sensor(-np.cross(rate, points_body)) for rate in rates])

@@ -293,8 +293,7 @@ def _place(latitude: str, longitude: str, fix: str, scale: float = 1.0) -> Reade
 
 def _velocity_holds(table: LogTable) -> Mask:
     """Rows of PX4 whose flags say that velocities hold."""
-    holds: Mask = np.min(table.stack("v_xy_valid", "v_z_valid"), axis=1) > 0
-    return holds
+    return np.asarray(np.min(table.stack("v_xy_valid", "v_z_valid"), axis=1) > 0)
 
 
 def _sees_down(table: LogTable) -> Mask:

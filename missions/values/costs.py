@@ -183,5 +183,4 @@ def _integral(power_w: Array, place: Array) -> Array:
     turns, index = np.divmod(low.astype(np.intp), len(power_w))
     share = place - low
     part = share * (power_w[index] + share / 2 * (following[index] - power_w[index]))
-    value: Array = turns * whole[-1] + whole[index] + part
-    return value
+    return np.asarray(turns * whole[-1] + whole[index] + part)

@@ -135,8 +135,7 @@ def warp(
     """Resample a picture into its virtual one; 0 beyond its rim."""
     homography = _FROM_CORNER @ rect_from_picture @ np.linalg.inv(_FROM_CORNER)
     size = (rectification.width_px, rectification.height_px)
-    warped: NDArray[np.uint8] = cv2.warpPerspective(picture, homography, size, flags=interpolation)
-    return warped
+    return np.asarray(cv2.warpPerspective(picture, homography, size, flags=interpolation))
 
 
 def depth_in_reference(
@@ -395,8 +394,7 @@ def enlarge(depth: Float32, size_px: tuple[int, int]) -> Float32:
     between = cv2.resize(1.0 / depth, size_px, interpolation=cv2.INTER_LINEAR)
     nearest = cv2.resize(depth, size_px, interpolation=cv2.INTER_NEAREST)
     known = np.isfinite(between) & np.isfinite(nearest)
-    large: Float32 = np.where(known, np.float32(1.0) / between, nearest)
-    return large
+    return np.asarray(np.where(known, np.float32(1.0) / between, nearest))
 
 
 def _valid(valid: NDArray[np.bool_], homography: Array, pair: Rectification) -> NDArray[np.bool_]:

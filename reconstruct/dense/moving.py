@@ -359,8 +359,7 @@ def find_odd(
     middle, low, high = (0.5 * (below + above)).transpose(1, 0, 2)
 
     def beyond(value: Float32, low: Float32, high: Float32) -> Float32:
-        off: Float32 = np.maximum(np.maximum(low - value, value - high), np.float32(0))
-        return off
+        return np.asarray(np.maximum(np.maximum(low - value, value - high), np.float32(0)))
 
     near = _rms(beyond(middle, shown[:, :, 1], shown[:, :, 2]), sigma) <= agreeing
     votes = sum(near[stations == one].any(axis=0).astype(np.int64) for one in np.unique(stations))
@@ -370,8 +369,7 @@ def find_odd(
 
 
 def _rms(apart: Float32, sigma: Float32) -> Float32:
-    rms: Float32 = np.sqrt(np.mean(np.square(apart / sigma), axis=-1))
-    return rms
+    return np.asarray(np.sqrt(np.mean(np.square(apart / sigma), axis=-1)))
 
 
 def _parts(misfit: Float32) -> Mask:

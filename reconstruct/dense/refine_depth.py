@@ -96,8 +96,7 @@ def even_contrast(grey: Float32) -> Float32:
 
 
 def _blur(picture: Float32, sigma_px: float) -> Float32:
-    blurred: Float32 = cv2.GaussianBlur(picture, (0, 0), sigma_px, borderType=cv2.BORDER_REFLECT)
-    return blurred
+    return np.asarray(cv2.GaussianBlur(picture, (0, 0), sigma_px, borderType=cv2.BORDER_REFLECT))
 
 
 @compiled(error_model="numpy", fastmath=FAST)

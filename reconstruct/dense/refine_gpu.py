@@ -79,8 +79,7 @@ class _Gpu(Device):
         return cuda.to_device(np.ascontiguousarray(values)) if is_array else values
 
     def get(self, array: Any) -> NDArray[Any]:
-        found: NDArray[Any] = array.copy_to_host()
-        return found
+        return np.asarray(array.copy_to_host())
 
     def empty(self, *shape: int) -> Any:
         return cuda.device_array(shape, np.float32)

@@ -489,5 +489,4 @@ def _aside(tree: cKDTree, place: Array, normal: Array) -> Array:
     near = np.bincount(i, minlength=count) + np.bincount(j, minlength=count) + 1
     middle = np.array([np.bincount(i, a, count) - np.bincount(j, a, count) for a in apart.T]).T
     away = np.linalg.norm(middle, axis=1) / near
-    found: Array = np.maximum(away - _MIN_ASIDE, 0.0)
-    return found
+    return np.asarray(np.maximum(away - _MIN_ASIDE, 0.0))

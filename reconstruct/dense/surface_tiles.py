@@ -96,8 +96,7 @@ class ErrorsOfPoses:
 def _along(covariances: Array, directions: Array) -> Array:
     """Variances (...,) along directions (..., 3) of covariances (..., 3, 3)."""
     found = np.einsum("...i,...ij,...j->...", directions, covariances, directions)
-    variances: Array = np.maximum(found, 0.0)
-    return variances
+    return np.asarray(np.maximum(found, 0.0))
 
 
 @progress.step("find what poses add to errors")

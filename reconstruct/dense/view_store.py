@@ -108,8 +108,7 @@ class ViewStore:
         half = tuple(slice(a, a + (n + 1) // 2) for a, n in zip(first, bright.shape, strict=True))
         tint = cv2.resize(self.load(view, "tint")[half], None, fx=2.0, fy=2.0)
         tint = tint[: bright.shape[0], : bright.shape[1]]
-        colour: NDArray[np.uint8] = cv2.cvtColor(np.dstack([bright, tint]), cv2.COLOR_YCrCb2BGR)
-        return colour
+        return np.asarray(cv2.cvtColor(np.dstack([bright, tint]), cv2.COLOR_YCrCb2BGR))
 
     def save_mask(self, view: int, name: str, mask: NDArray[np.bool_]) -> None:
         """Keep a mask (H, W), one bit a pixel."""

@@ -251,8 +251,7 @@ def _follow(
         alike = np.mean(sigma[ring] ** 2) * noise_area / (count * cell**2)
         if sign * mean > _RING_SIGMAS * np.sqrt(alike + np.mean(registration[ring]) ** 2):
             reach = looked
-    grown: NDArray[np.bool_] = (inside | (free & (away <= reach))) & known
-    return grown
+    return np.asarray((inside | (free & (away <= reach))) & known)
 
 
 def _measure(

@@ -215,8 +215,7 @@ def _local(points: Array, crs: str, datum: Datum) -> Array:
     ).transform(points[:, 0], points[:, 1])
     place = np.column_stack([latitude, longitude, datum.height_m - points[:, 2]])
     ned = datum.ned_from_geodetic(place[np.isfinite(place).all(axis=1)])
-    enu: Array = ned[:, [1, 0, 2]] * np.array([1.0, 1.0, -1.0])
-    return enu
+    return np.asarray(ned[:, [1, 0, 2]] * np.array([1.0, 1.0, -1.0]))
 
 
 def read_own_cloud(workspace: Path) -> Array:

@@ -219,8 +219,7 @@ def spread_over(vertices: Array, triangles: Array, count: int, rng: np.random.Ge
     share = rng.random((count, 2))
     over = share.sum(axis=1) > 1
     share[over] = 1 - share[over]
-    points: Array = corners[chosen, 0] + np.einsum("nk,nkj->nj", share, sides[chosen])
-    return points
+    return np.asarray(corners[chosen, 0] + np.einsum("nk,nkj->nj", share, sides[chosen]))
 
 
 _PATCH_PX = 96
@@ -356,8 +355,7 @@ def _true_reflectance(terrain: Terrain, texture: Texture, places: Array, pixel_m
     points, material = surface_material(terrain, places)
     footprint = np.full(len(points), pixel_m, dtype=np.float32)
     colour = texture.albedo(points, material, footprint)
-    grey: Array = colour.mean(axis=1).reshape(_PATCH_PX, _PATCH_PX).astype(np.float64)
-    return grey
+    return np.asarray(colour.mean(axis=1).reshape(_PATCH_PX, _PATCH_PX).astype(np.float64))
 
 
 def _shift_px(picture: Array, true: Array) -> NDArray[np.float64] | None:

@@ -80,8 +80,7 @@ def surface_distance(terrain: Terrain, points_ned: Array) -> Array:
 
     local = (points_ned - terrain.offset_ned).astype(np.float32)
     found = terrain.raycasting_scene().compute_distance(o3d.core.Tensor(local))
-    distance: Array = found.numpy().astype(np.float64)
-    return distance
+    return np.asarray(found.numpy().astype(np.float64))
 
 
 @progress.step("measure a pixel on the ground")

@@ -222,8 +222,7 @@ def blur_valid(
         cv2.GaussianBlur(cv2.resize(part, size, interpolation=cv2.INTER_AREA), (0, 0), 1.0)
         for part in (picture * weight[..., None], weight)
     )
-    low: NDArray[np.float32] = total / np.maximum(share, np.float32(1e-3))[..., None]
-    return low
+    return np.asarray(total / np.maximum(share, np.float32(1e-3))[..., None])
 
 
 def at_places(
@@ -546,8 +545,7 @@ def neutral_factors(level: Array) -> Array:
     purple) and the largest value ("shades of gray", Finlayson & Trezzi 2004).
     """
     cast = (level**_NORM).mean(axis=0) ** (1.0 / _NORM)
-    neutral: Array = cast.mean() / cast
-    return neutral
+    return np.asarray(cast.mean() / cast)
 
 
 def brightening(level: Array, bright: float, middle: float) -> float:

@@ -64,8 +64,7 @@ def loss_scale(sigma_px: float) -> float:
 
 def cauchy_weights(residuals: Array, sigma_px: float) -> Array:
     """Weights (O,) of observations that miss by (O, 2) pixels."""
-    weights: Array = 1.0 / (1.0 + (residuals**2).sum(axis=1) / loss_scale(sigma_px) ** 2)
-    return weights
+    return np.asarray(1.0 / (1.0 + (residuals**2).sum(axis=1) / loss_scale(sigma_px) ** 2))
 
 
 def cauchy_cost(residuals: Array, sigma_px: float) -> float:

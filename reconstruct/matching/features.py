@@ -113,8 +113,7 @@ def root_sift(descriptors: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Square roots of L1-normalised SIFT (Arandjelovic & Zisserman 2012), times 512 in bytes."""
     total = np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-9)
     root = np.sqrt(np.maximum(descriptors, 0.0) / total)
-    rounded: NDArray[np.uint8] = np.minimum(np.rint(512.0 * root), 255).astype(np.uint8)
-    return rounded
+    return np.asarray(np.minimum(np.rint(512.0 * root), 255).astype(np.uint8))
 
 
 def spread(

@@ -281,8 +281,7 @@ def fit_homography(first: Array, second: Array) -> Array:
         ]
     )
     middle = np.linalg.eigh(rows.T @ rows)[1][:, 0].reshape(3, 3)
-    found: Array = np.linalg.inv(norms[1]) @ middle @ norms[0]
-    return found
+    return np.asarray(np.linalg.inv(norms[1]) @ middle @ norms[0])
 
 
 def apply_homography(homography: Array, pixels: Array) -> Array:

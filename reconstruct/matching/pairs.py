@@ -62,8 +62,7 @@ class Frusta:
     @property
     def middles(self) -> Array:
         """(N, 3) the middle of what each may show."""
-        found: Array = self.points[:, self.points.shape[1] // 2].mean(axis=1)
-        return found
+        return np.asarray(self.points[:, self.points.shape[1] // 2].mean(axis=1))
 
     @property
     def reach_m(self) -> float:
@@ -153,8 +152,7 @@ def _seen_by(frusta: Frusta, i: int, j: int, wide_m: float) -> Array:
         beyond = np.array([camera.width_px, camera.height_px]) + margin[:, None]
         with np.errstate(invalid="ignore"):
             inside[facing] = ((pixels > -margin[:, None]) & (pixels < beyond)).all(axis=1)
-    share: Array = inside.mean(axis=1)
-    return share
+    return np.asarray(inside.mean(axis=1))
 
 
 def near_pairs(frusta: Frusta, chosen: NDArray[np.bool_], slack_m: Array) -> list[Pair]:
@@ -596,8 +594,7 @@ def nearest_looks(
 
 def _directions(looks: NDArray[np.float32], mean: NDArray[np.float32]) -> NDArray[np.float32]:
     away = looks - mean
-    found: NDArray[np.float32] = away / np.maximum(np.linalg.norm(away, axis=1)[:, None], 1e-9)
-    return found
+    return np.asarray(away / np.maximum(np.linalg.norm(away, axis=1)[:, None], 1e-9))
 
 
 def make_codebook(features: Sequence[Path], seed: int) -> NDArray[np.float32]:
@@ -626,16 +623,14 @@ def describe(features: Path, words: NDArray[np.float32]) -> NDArray[np.float32]:
     word = _nearest_words(descriptors, words)
     sums = _sums(descriptors - words[word], word, len(words))
     norms = np.linalg.norm(sums, axis=1, keepdims=True)
-    found: NDArray[np.float32] = (sums / np.maximum(norms, 1e-9)).ravel().astype(np.float32)
-    return found
+    return np.asarray((sums / np.maximum(norms, 1e-9)).ravel().astype(np.float32))
 
 
 def _nearest_words(
     descriptors: NDArray[np.float32], words: NDArray[np.float32]
 ) -> NDArray[np.intp]:
     distances = (words**2).sum(axis=1) - 2 * descriptors @ words.T
-    nearest: NDArray[np.intp] = np.argmin(distances, axis=1)
-    return nearest
+    return np.asarray(np.argmin(distances, axis=1))
 
 
 def _sums(rows: NDArray[np.float32], word: NDArray[np.intp], words: int) -> Array:

@@ -450,8 +450,7 @@ def without_pairs(triangles: Triangles) -> Triangles:
     _, group, count = np.unique(
         np.sort(triangles, axis=1), axis=0, return_inverse=True, return_counts=True
     )
-    single: Triangles = triangles[count[group.reshape(-1)] == 1]
-    return single
+    return np.asarray(triangles[count[group.reshape(-1)] == 1])
 
 
 def farthest(points: Array, vertices: Array, triangles: Triangles) -> float:

@@ -237,8 +237,7 @@ def even_colour(pictures: Pictures, view: View, factors: Float32, part: Part = W
     )
     at = np.meshgrid(x, y)
     lift = cv2.remap(factors, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    even: Float32 = colour.astype(np.float32) * lift
-    return even
+    return np.asarray(colour.astype(np.float32) * lift)
 
 
 def _part_around(view: View, low: Array, high: Array, margin: int) -> Part:

@@ -97,8 +97,7 @@ def component_areas(vertices: Array, triangles: Triangles) -> tuple[NDArray[np.i
 
 def face_areas(vertices: Array, triangles: Triangles) -> Array:
     """(T,) areas in squared units of length."""
-    areas: Array = 0.5 * np.linalg.norm(_crosses(vertices, triangles), axis=1)
-    return areas
+    return np.asarray(0.5 * np.linalg.norm(_crosses(vertices, triangles), axis=1))
 
 
 def face_normals(vertices: Array, triangles: Triangles) -> Array:
@@ -120,10 +119,8 @@ def _crosses(vertices: Array, triangles: Triangles) -> Array:
 
 
 def _unit(vectors: Array) -> Array:
-    unit: Array = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-30)
-    return unit
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-30))
 
 
 def _square(vectors: Array) -> Array:
-    square: Array = (vectors * vectors).sum(axis=1)
-    return square
+    return np.asarray((vectors * vectors).sum(axis=1))

@@ -73,8 +73,7 @@ class _Shape(NamedTuple):
 
 def to_world(points_enu: Array, offset_enu: Array) -> Array:
     """Points (N, 3) of a mesh, east, north, up from an offset, in the world frame of views."""
-    world: Array = (points_enu + offset_enu) @ _ENU_TO_NED.T
-    return world
+    return np.asarray((points_enu + offset_enu) @ _ENU_TO_NED.T)
 
 
 def find_candidates(
@@ -229,8 +228,7 @@ def distances_from(vertices: Array, triangles: Triangles, points: Array) -> Arra
     middle = points.mean(axis=0) if len(points) else vertices[0]
     scene = ray_scene((vertices - middle, triangles))
     found = scene.compute_distance(o3d.core.Tensor((points - middle).astype(np.float32)), 1)
-    distances: Array = found.numpy().astype(np.float64)
-    return distances
+    return np.asarray(found.numpy().astype(np.float64))
 
 
 def ray_scene(*meshes: tuple[Array, Triangles]) -> Any:

@@ -237,5 +237,4 @@ def _expand(total: Float32, share: Float32, size: tuple[int, int]) -> Float32:
     mean = total / np.maximum(share, _NOTHING)[..., None] * known[..., None]
     spread = cv2.pyrUp(known, dstsize=size)
     broad = cv2.pyrUp(mean, dstsize=size) / np.maximum(spread, _NOTHING)[..., None]
-    found: Float32 = broad.astype(np.float32)
-    return found
+    return np.asarray(broad.astype(np.float32))

@@ -617,8 +617,7 @@ def lanczos_weights() -> Float32:
     fraction = np.arange(_FRACTIONS + 1) / _FRACTIONS
     offset = fraction[:, None] - (np.arange(_TAPS) - (_TAPS // 2 - 1))
     weights = np.sinc(offset) * np.sinc(offset / (_TAPS // 2))
-    rows: Float32 = (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32)
-    return rows
+    return np.asarray((weights / weights.sum(axis=1, keepdims=True)).astype(np.float32))
 
 
 @compiled

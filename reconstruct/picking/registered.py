@@ -182,5 +182,4 @@ def _in_cone(points_cam: Array, warp: PinholeWarp) -> NDArray[np.bool_]:
         return np.ones(len(points_cam), np.bool_)
     start = float(np.linalg.norm(warp.camera.unproject(warp.camera.border())[0], axis=1).max())
     away = np.linalg.norm(points_cam[:, :2], axis=1)
-    found: NDArray[np.bool_] = away <= 1.05 * slopes.max() * points_cam[:, 2] + start
-    return found
+    return np.asarray(away <= 1.05 * slopes.max() * points_cam[:, 2] + start)

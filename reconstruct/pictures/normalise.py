@@ -68,8 +68,7 @@ def even_light(picture: Deep) -> NDArray[np.float32]:
     )
     small = cv2.GaussianBlur(small, (0, 0), sigma / shrink, borderType=cv2.BORDER_REFLECT)
     background = cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR)
-    ratio: NDArray[np.float32] = grey / np.maximum(background, floor)
-    return ratio
+    return np.asarray(grey / np.maximum(background, floor))
 
 
 def finely(ratio: NDArray[np.float32]) -> NDArray[np.uint16]:
@@ -102,5 +101,4 @@ def normalise(picture: Deep) -> Grey:
     ratio = even_light(picture)
     grey = np.clip(ratio * np.float32(110.0), 0, 255).astype(np.uint8)
     tiles = (_TILES, _TILES)
-    equalised: Grey = cv2.createCLAHE(clipLimit=_CLIP, tileGridSize=tiles).apply(grey)
-    return equalised
+    return np.asarray(cv2.createCLAHE(clipLimit=_CLIP, tileGridSize=tiles).apply(grey))

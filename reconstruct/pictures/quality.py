@@ -162,8 +162,7 @@ def _blocks_of(values: NDArray[Any]) -> NDArray[Any]:
 
 
 def _per_block(values: NDArray[np.float32]) -> NDArray[np.float64]:
-    means: NDArray[np.float64] = _blocks_of(values).mean(axis=(1, 3), dtype=np.float64)
-    return means
+    return np.asarray(_blocks_of(values).mean(axis=(1, 3), dtype=np.float64))
 
 
 def _noise(values: NDArray[np.float32], blocks: NDArray[np.bool_]) -> float:

@@ -226,8 +226,7 @@ class Pictures:
             return inside.copy()
         x, y = (axis[part] for axis in self.maps(image))
         warped = cv2.remap(taken.astype(np.uint8), x, y, cv2.INTER_NEAREST)
-        mask: Mask = inside & (warped > 0)
-        return mask
+        return np.asarray(inside & (warped > 0))
 
     def _camera_inside(self, camera: str) -> Mask:
         width, height = self._warps[camera].size_px

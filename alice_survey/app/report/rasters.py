@@ -262,8 +262,7 @@ class Pyramid:
                 1, window=window, out_shape=shape, out_dtype="float32", masked=True,
                 resampling=Resampling.average,
             )  # fmt: skip
-        values: Array = read.filled(np.nan)
-        return values
+        return np.asarray(read.filled(np.nan))
 
     def _paint(self, size: Level, left: int, top: int, right: int, bottom: int) -> Rgba:
         window, shape = self._window(size, left, top, right, bottom)

@@ -68,8 +68,7 @@ class TerrainObject:
         for corner in range(3):
             np.add.at(sums, self.triangles[:, corner], faces)
         length = np.linalg.norm(sums, axis=1, keepdims=True)
-        normals: Floats = (sums / np.maximum(length, 1e-30)).astype(np.float32)
-        return normals
+        return np.asarray((sums / np.maximum(length, 1e-30)).astype(np.float32))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -492,8 +491,7 @@ def ground_relief(
         ripple_height_m = 0.0
     heights = shape / np.ptp(shape) * relief_m + ripple_height_m * ripples
     heights *= relief_m / max(float(np.ptp(heights)), 1e-12)
-    result: Array = heights - heights.mean()
-    return result
+    return np.asarray(heights - heights.mean())
 
 
 def trough_share(sand: Array, grid_m: float) -> Array:
@@ -600,8 +598,7 @@ def _dome(rock: Rock, north_m: Array, east_m: Array) -> Array:
     cuts = [level + slope_u * u + slope_v * v for slope_u, slope_v, level in rock.faces]
     # A smooth minimum of dome and planes: faces with worn edges.
     stone = -_EDGE * np.logaddexp.reduce([-surface / _EDGE for surface in (profile, *cuts)])
-    dome: Array = rock.height_m * (stone - rock.buried) + rock.radius_m * bumps * (r2 < 1.0)
-    return dome
+    return np.asarray(rock.height_m * (stone - rock.buried) + rock.radius_m * bumps * (r2 < 1.0))
 
 
 def _cosines(
@@ -650,8 +647,7 @@ def _ripples(north_m: Array, east_m: Array, wind_rad: float, rng: np.random.Gene
     which = _cosines(north_m, east_m, 16, (0.8, 3.0), 0.0, math.pi, rng)
     first = 1.0 / (1.0 + np.exp(-4.0 * which / which.std()))
     # Crests fork where one train of waves gives way to the other.
-    ripples: Array = strength * (first * trains[0] + (1.0 - first) * trains[1])
-    return ripples
+    return np.asarray(strength * (first * trains[0] + (1.0 - first) * trains[1]))
 
 
 def build_terrain(

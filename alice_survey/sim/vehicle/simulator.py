@@ -333,8 +333,7 @@ class Flown:
     @property
     def energy_j(self) -> Array:
         """(n,) electrical energy of each thruster over the mission."""
-        energy: Array = self.power_w.sum(axis=0) * TICK_S
-        return energy
+        return np.asarray(self.power_w.sum(axis=0) * TICK_S)
 
 
 def simulate(

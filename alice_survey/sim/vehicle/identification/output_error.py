@@ -134,8 +134,7 @@ def jackknife_covariance(stretches: Stretches, prior: Array) -> Array | None:
     )
     # Errors by a spread of few are spread as Student's t, with a variance of n / (n - 2).
     student = (count - 1.0) / (count - 3.0)
-    covariance: Array = student * (count - 1.0) / count * (moves.T @ moves)
-    return covariance
+    return np.asarray(student * (count - 1.0) / count * (moves.T @ moves))
 
 
 def design_effect(stretches: Stretches, prior: Array) -> float:
@@ -679,5 +678,4 @@ def _inverse(information: Array, names: Sequence[str]) -> Array:
         raise VehicleError(
             f"the logs cannot separate {', '.join(mixed)}: free fewer of them, or add manoeuvres"
         )
-    inverse: Array = (vectors / values) @ vectors.T / np.outer(scale, scale)
-    return inverse
+    return np.asarray((vectors / values) @ vectors.T / np.outer(scale, scale))
