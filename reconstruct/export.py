@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from rasterio.enums import Resampling
 from rasterio.vrt import WarpedVRT
 from rasterio.warp import calculate_default_transform
+from scipy.ndimage import map_coordinates
 
 from alice_survey.core import products
 from alice_survey.core.artefacts import Stage, atomic_path, run_stage, write_json
@@ -34,6 +35,7 @@ from alice_survey.core.records import MeshRecord, SurfaceRecord
 from alice_survey.core.run import progress
 from reconstruct.copc import PointSpool, write_copc
 from reconstruct.evaluate.scores import read_mesh
+from reconstruct.mesh.visibility import ray_scene
 from reconstruct.pictures.undistorted import Pictures
 from reconstruct.raster import BLOCK, local_crs, opened_raster, small_cache, tiles_of_shape
 from reconstruct.stages import DENSE, MESH, MOSAIC, PLACING
@@ -426,15 +428,7 @@ def bilinear(values: NDArray[Any], x: Array, y: Array) -> Array:
 
     cv2.remap rounds places to 1/32 of a pixel.
     """
-    rows, columns = values.shape
-    inside = (x >= 0) & (y >= 0) & (x <= columns - 1) & (y <= rows - 1)  # NaN compares as False
-    x, y = np.where(inside, x, 0.0), np.where(inside, y, 0.0)
-    column = np.clip(x.astype(np.int64), 0, columns - 2)
-    row = np.clip(y.astype(np.int64), 0, rows - 2)
-    p, q = x - column, y - row
-    above = values[row, column] * (1 - p) + values[row, column + 1] * p
-    below = values[row + 1, column] * (1 - p) + values[row + 1, column + 1] * p
-    return np.asarray(np.where(inside, above * (1 - q) + below * q, np.nan))
+    return np.asarray(map_coordinates(values, [y, x], np.float64, order=1, cval=np.nan))
 
 
 def scene_of(mesh: Path) -> tuple[Any, Array]:
@@ -444,16 +438,9 @@ def scene_of(mesh: Path) -> tuple[Any, Array]:
 
 @lru_cache(maxsize=1)
 def _scene(mesh: Path, written_ns: int) -> tuple[Any, Array]:
-    import open3d as o3d
-
     vertices, triangles = read_mesh(mesh)
     origin = vertices.mean(axis=0)
-    scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(
-        o3d.core.Tensor.from_numpy((vertices - origin).astype(np.float32)),
-        o3d.core.Tensor.from_numpy(np.ascontiguousarray(triangles.astype(np.uint32))),
-    )
-    return scene, origin
+    return ray_scene((vertices - origin, triangles)), origin
 
 
 def _write_colmap(model: Path, folder: Path, names: dict[str, str]) -> None:

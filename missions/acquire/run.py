@@ -313,16 +313,7 @@ def _write_poses(
 
 
 def _write_picture(path: Path, picture: NDArray[Any]) -> None:
-    options = {
-        ".png": [
-            cv2.IMWRITE_PNG_COMPRESSION,
-            1,
-            cv2.IMWRITE_PNG_STRATEGY,
-            cv2.IMWRITE_PNG_STRATEGY_RLE,
-        ],
-        ".jpg": [cv2.IMWRITE_JPEG_QUALITY, 95],
-        ".tif": [],
-    }[path.suffix]
+    rle = cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE
     with atomic_path(path) as temporary:
-        if not cv2.imwrite(str(temporary), picture, options):
+        if not cv2.imwrite(str(temporary), picture, [cv2.IMWRITE_PNG_COMPRESSION, 1, *rle]):
             raise ImageError(f"{path} cannot be written: is the disk full?")
