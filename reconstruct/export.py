@@ -440,7 +440,7 @@ def scene_of(mesh: Path) -> tuple[Any, Array]:
 def _scene(mesh: Path, written_ns: int) -> tuple[Any, Array]:
     vertices, triangles = read_mesh(mesh)
     origin = vertices.mean(axis=0)
-    return ray_scene((vertices - origin, triangles)), origin
+    return ray_scene((vertices - origin, triangles.astype(np.int32))), origin
 
 
 def _write_colmap(model: Path, folder: Path, names: dict[str, str]) -> None:

@@ -42,6 +42,7 @@ from reconstruct.measure.figures import (
     of_points,
     plan_area,
     polyline,
+    slopes_of,
 )
 from reconstruct.measure.surface import MeasuredSurface, Samples
 from reconstruct.raster import crs_of, opened_raster
@@ -106,7 +107,10 @@ def measure_line(
         ReconstructionError: a vertex has no height, or the line is too short or too long.
     """
     along = surface_length(surface, profile(surface, vertices))
-    figures = _of_ends(surface, surface.known_at(as_places(vertices)))
+    picks = surface.known_at(as_places(vertices))
+    clicks = picks.click_variance(slopes_of(polyline, picks.points - picks.points.mean(axis=0)))
+    along = replace(along, own=math.hypot(along.own, math.sqrt(clicks)))
+    figures = _of_ends(surface, picks)
     return (*figures[:-3], along, *figures[-3:])
 
 
@@ -244,6 +248,8 @@ def measure_polygon(
         )
     areas, region = surface_within(surface, polygon), PolygonOnGrid(surface, polygon)
     notes = []
+    if surface.click:
+        notes.append("where corners were clicked is not counted in slope, height and volume")
     if areas.share < 0.999:
         notes.append(
             f"{areas.share:.1%} of the polygon is known: area of the surface, volume, slope and "
@@ -253,7 +259,7 @@ def measure_polygon(
     slope, aspect, mean, *volumes = _plane_figures(region, base)
     figures = [
         of_points(surface, ring, "plan_area", "Area in plan", plan_area, 2),
-        *figures_of_all(surface, [areas]),
+        *_of_surface(surface, [areas], [polygon]),
         slope,
         aspect,
         mean,
@@ -419,11 +425,8 @@ def measure_polygon_file(
         raise ConfigError(f"{output}: results are written to a .csv or a .geojson")
     surface = MeasuredSurface.of(workspace)
     polygons = read_polygons(file, surface, label)
-    sigma, notes = pick_sigma_px * _pixel(surface), list(surface.errors.notes)
-    if pick_sigma_px:
-        notes = [n for n in notes if "place was picked" not in n]
-        notes.insert(0, f"counted: sigma of a corner, {pick_sigma_px:g} pixels of the mosaic")
-    measured, faults = [], []
+    surface = surface.picked_to(pick_sigma_px * _pixel(surface))
+    notes, measured, faults = list(surface.errors.notes), [], []
     with progress.step("measure polygons", len(polygons)) as step:
         for polygon in polygons:
             areas = None
@@ -435,19 +438,19 @@ def measure_polygon_file(
                     )
             except ReconstructionError as error:
                 faults.append(f"{polygon.name}: {error}")
-            by_plan = plan_slopes_of(surface, polygon.geometry, sigma)
+            by_plan = plan_slopes_of(surface, polygon.geometry)
             measured.append((polygon, by_plan, areas))
             step.advance()
     notes = [*faults, *notes]
     lines, each, labels = [], [], []
     for one in measured:
-        figures = _figures(surface, [one], sigma)
+        figures = _figures(surface, [one])
         lines.append(_line(f"{one[0].name} ({one[0].label})", figures))
         each.append([figure.to_json() for figure in figures])
     known = _known_area(surface)
     for name, group in groupby(sorted(measured, key=_label), _label):
         same = list(group)
-        figures = _figures(surface, same, sigma)
+        figures = _figures(surface, same)
         covered = float(shapely.union_all([one.geometry for one, _, _ in same]).area) / known
         figures += (
             Measured(
@@ -542,13 +545,12 @@ def _place_polygon(polygon: BaseGeometry, crs: str | None, surface: MeasuredSurf
     return shapely.transform(polygon, lambda xy: np.column_stack(to.transform(*xy.T)))
 
 
-def plan_slopes_of(surface: MeasuredSurface, polygon: BaseGeometry, sigma: float) -> PackedSlopes:
+def plan_slopes_of(surface: MeasuredSurface, polygon: BaseGeometry) -> PackedSlopes:
     """What moves the area in plan of a polygon, whose corners a picture of the surface showed.
 
     Args:
         surface: that it is on.
         polygon: or several, with holes or without.
-        sigma: of a corner in each axis.
     """
     gathered = FigureSlopes(surface.errors)
     for places, slopes in _corners(polygon):
@@ -557,28 +559,31 @@ def plan_slopes_of(surface: MeasuredSurface, polygon: BaseGeometry, sigma: float
         samples = replace(
             found, own=np.where(known, found.own, 0.0), sight=np.where(known, found.sight, 0.0)
         )
-        own = samples.own_variance(slopes) + sigma**2 * float((slopes**2).sum())
-        gathered.add(places, slopes, own)
+        gathered.add(places, slopes, samples.own_variance(slopes))
     return gathered.packed
 
 
-def _figures(
-    surface: MeasuredSurface, parts: Sequence[_PolygonAreas], sigma: float
-) -> tuple[Measured, ...]:
-    """Area in plan of polygons together, and where it is known that of the surface, and rugosity.
-
-    Where corners were drawn wrongly the surface gains as the plan does, times its mean rugosity.
-    """
+def _figures(surface: MeasuredSurface, parts: Sequence[_PolygonAreas]) -> tuple[Measured, ...]:
+    """Area in plan of polygons together; where it is known that of the surface, and rugosity."""
     area = math.fsum(float(one.geometry.area) for one, _, _ in parts)
     by_plan = sum_slopes([(1.0, slopes) for _, slopes, _ in parts])
     plan = figure(surface, "plan_area", "Area in plan", area, by_plan, 2)
     known = [areas for _, _, areas in parts if areas is not None]
     if not known:
         return (plan,)
+    return plan, *_of_surface(surface, known, [one.geometry for one, _, _ in parts])
+
+
+def _of_surface(
+    surface: MeasuredSurface, known: Sequence[SurfaceAreas], drawn: Sequence[BaseGeometry]
+) -> tuple[Measured, Measured]:
+    """Area of the surface within polygons as they were drawn, and its rugosity.
+
+    Where corners were drawn wrongly the surface gains as the plan does, times its mean rugosity.
+    """
     slanted, rugosity = figures_of_all(surface, known)
-    drawn = sigma * math.sqrt(sum(_corner_gain(one.geometry) for one, _, _ in parts))
-    own = math.hypot(slanted.own, rugosity.value * drawn)
-    return plan, replace(slanted, own=own), rugosity
+    gain = surface.click * math.sqrt(sum(map(_corner_gain, drawn)))
+    return replace(slanted, own=math.hypot(slanted.own, rugosity.value * gain)), rugosity
 
 
 def _corners(polygon: BaseGeometry) -> Iterator[tuple[Array, Array]]:

@@ -97,6 +97,10 @@ class Samples:
     """(N,) variances by what all heights share."""
     sight: Array
     """(N, 2) how far a place moves aside with the own error of its height."""
+    tilt: Array
+    """(N, 2) rise of the surface to the right and up."""
+    click: float = 0.0
+    """Standard deviation of each coordinate of a place."""
 
     @property
     def points(self) -> Array:
@@ -125,7 +129,15 @@ class Samples:
         kicks = np.bincount(cell_of.ravel(), kick, minlength=len(cells))
         i, j = KDTree(cells).query_pairs(REACH_CELLS + 0.5, output_type="ndarray").T
         fading = own_correlation(np.linalg.norm(cells[i] - cells[j], axis=1))
-        return float(kicks @ kicks + 2.0 * (kicks[i] * kicks[j] * fading).sum())
+        own = float(kicks @ kicks + 2.0 * (kicks[i] * kicks[j] * fading).sum())
+        return own + self.click_variance(motions)
+
+    def click_variance(self, motions: Array) -> float:
+        """The part of it by clicks that miss their places, on a surface that rises there."""
+        moved = motions[:, :2] + motions[:, 2:] * np.nan_to_num(self.tilt)
+        _, place = np.unique(self.places, axis=0, return_inverse=True)
+        sums = [np.bincount(place.ravel(), part) for part in moved.T]
+        return self.click**2 * float(np.square(sums).sum())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,6 +152,8 @@ class MeasuredSurface:
     """Of the model."""
     plane: Plane
     errors: SharedErrors
+    click: float = 0.0
+    """Standard deviation of each coordinate of a place that is picked."""
 
     @classmethod
     def of(cls, workspace: Path) -> "MeasuredSurface":
@@ -163,6 +177,14 @@ class MeasuredSurface:
             plane=plane,
             errors=replace(errors, notes=(*errors.notes, _PICKING, _RESOLVED)),
         )
+
+    def picked_to(self, click: float) -> "MeasuredSurface":
+        """The same, with places that are picked to so much in each coordinate; 0 is not known."""
+        if not click:
+            return self
+        notes = (f"counted: places picked to {click:.2g} {self.unit} in each coordinate",
+                 *(note for note in self.errors.notes if note != _PICKING))  # fmt: skip
+        return replace(self, click=click, errors=replace(self.errors, notes=notes))
 
     @property
     def unit(self) -> str:
@@ -214,15 +236,18 @@ class MeasuredSurface:
         idle = weights == 0.0
         heights[idle & ~np.isfinite(heights)] = 0.0
         own[idle & ~np.isfinite(own)] = 0.0
+        to_right = (1 - y) * (heights[:, 1] - heights[:, 0]) + y * (heights[:, 3] - heights[:, 2])
+        up = (1 - x) * (heights[:, 0] - heights[:, 2]) + x * (heights[:, 1] - heights[:, 3])
         return Samples(
             places=places, height=(weights * heights).sum(axis=1), cells=cells, weights=weights,
             own=own, shared=self.errors.variance_of_heights(places),
             sight=np.zeros((len(places), 2)),
+            tilt=np.column_stack([to_right, up]) / self.grid.cell,
         )  # fmt: skip
 
     def at_picks(self, places: Array) -> Samples:
         """Spots that were picked where the mosaic shows them; see `sight_lines`."""
-        found = self.at(places)
+        found = replace(self.at(places), click=self.click)
         lines = sight_lines(self.workspace, self.plane, found.points)
         return found if lines is None else replace(found, sight=lines)
 

@@ -121,6 +121,33 @@ def test_noise_makes_no_floor_rougher(tmp_path: Path) -> None:
         assert abs(np.mean(line)) < 0.25 * noise, (sigma, np.mean(line) / noise)
 
 
+def test_clicks_are_in_the_sigmas_of_what_their_places_decide(tmp_path: Path) -> None:
+    """Against moves of each coordinate, over a slope; what clicks do is all that errs."""
+    surface = without_errors(tmp_path, grid(1.0, 0.05), lambda x, y: 0.3 * x - 0.2 * y)
+    line = np.array([(-0.31, -0.22), (0.05, 0.13), (0.36, 0.17)])
+    corners = np.array([(-0.3, -0.3), (0.3, -0.2), (0.25, 0.3), (-0.2, 0.25)])
+
+    def all_of(surface: MeasuredSurface, line: Array, corners: Array) -> dict[str, Measured]:
+        areas = named(measure_polygon(surface, corners.tolist(), None)[0])
+        kept = {name: areas[name] for name in ("plan_area", "surface_area", "perimeter")}
+        return kept | named(measure_line(surface, line.tolist()))
+
+    click, step = 0.004, 1e-4
+    stated = all_of(surface.picked_to(click), line, corners)
+    gains = dict.fromkeys(stated, 0.0)
+    for places in (line, corners):
+        for at in np.ndindex(places.shape):
+            ends = []
+            for sign in (1, -1):
+                places[at] += sign * step
+                ends.append(all_of(surface, line, corners))
+                places[at] -= sign * step
+            for name in gains:
+                gains[name] += ((ends[0][name].value - ends[1][name].value) / (2 * step)) ** 2
+    for name, one in stated.items():
+        assert one.sigma == pytest.approx(click * gains[name] ** 0.5, rel=0.03), name
+
+
 SLOW, OWN = pytest.mark.slow, Sigmas(own=0.0012)
 SHARED = Sigmas(shift=0.004, tilt=0.002, scale=0.002, bend=0.004)
 
@@ -242,7 +269,9 @@ def test_squares_are_covered_as_shapely_cuts_them(seed: int, corners: int, whole
     hole = middle + 0.3 * (outer - middle)
     if whole:
         outer = np.round(outer)
-    polygon = shapely.make_valid(shapely.Polygon(outer, [hole] if rng.random() < 0.5 else []))
+    polygon = shapely.make_valid(shapely.Polygon(outer))
+    if rng.random() < 0.5:
+        polygon = shapely.difference(polygon, shapely.make_valid(shapely.Polygon(hole)))
     parts = [p for p in shapely.get_parts(polygon) if p.geom_type == "Polygon"]
     turned = [shapely.orient_polygons(part, exterior_cw=True) for part in parts]
     rings = [shapely.get_coordinates(ring) for part in turned for ring in shapely.get_rings(part)]

@@ -101,7 +101,7 @@ def test_results_are_written_for_spreadsheets_and_maps(
 
 def test_the_sigma_of_an_area_is_that_of_drawn_corners(surface: MeasuredSurface) -> None:
     sigma, rng = 0.002, np.random.default_rng(1)
-    stated = figure(surface, "", "", 1.0, plan_slopes_of(surface, HOLED, sigma), 0).sigma
+    stated = figure(surface, "", "", 1.0, plan_slopes_of(surface.picked_to(sigma), HOLED), 0).sigma
     rings = [shapely.get_coordinates(ring)[:-1] for ring in shapely.get_rings(HOLED)]
     draws = []
     for _ in range(2000):

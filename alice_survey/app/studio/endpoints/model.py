@@ -57,6 +57,8 @@ class AskedMeasure(Config):
     places: list[tuple[Coordinate, ...]] = Field(min_length=2, max_length=_MAX_PLACES)
     base: Coordinate | Literal["rim"] | None = None
     """Plane of a polygon's volume."""
+    click: float = Field(0.0, ge=0, le=1e6)
+    """Standard deviation of each coordinate of a place; 0 is not known."""
 
 
 class ExportedFigure(Config):
@@ -169,7 +171,8 @@ class _ModelTab:
             raise AliceError(f"the request: places of {asked.kind!r} have {size} numbers")
         notes: tuple[str, ...] = ()
         figures: tuple[Measured, ...]
-        with self._surface() as surface:
+        with self._surface() as found:
+            surface = found.picked_to(asked.click)
             if asked.kind == "line":
                 figures = measure_line(surface, asked.places)
             elif asked.kind == "points":

@@ -96,7 +96,7 @@ export function tab(studio) {
     drawing.begin({
       kind: tool.kind, colour: RED, most: tool.ends, ended: () => held(null),
       done: (points) => measure(name, {
-        kind: tool.kind, places: points.map(([north, east]) => [east, north]),
+        kind: tool.kind, click: 2 ** -map.leaflet.getZoom(), places: points.map(([n, e]) => [e, n]),
         ...(name === "volume" ? {base: level.value ? level.valueAsNumber : "rim"} : {}),
       }),
     });
