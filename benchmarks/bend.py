@@ -13,7 +13,6 @@ rigid alignment; the scale; and errors over stated sigmas of the sag, the shape,
 attitude of all stations. FOLDER keeps the flights and the calibration.
 """
 
-import argparse
 import importlib
 import sys
 import time
@@ -38,8 +37,7 @@ from benchmarks.bend_survey import (
     start,
     wrong_rig,
 )
-from benchmarks.figures import Figure, Findings, add_options, hand_over
-from benchmarks.machine import heading, machine
+from benchmarks.figures import Figure, Findings, Parser, hand_over
 from camera_calib.rig import Rig
 from reconstruct.placing.alignment import align_rigid, align_similarity, sag_weights
 
@@ -100,12 +98,33 @@ class Score:
 
 def main() -> None:
     """Print the table."""
-    options = _options()
+    parser = Parser(
+        __doc__,
+        quick="one survey of the demo, calibration as stated and 3 times worse",
+        work="keeps flights and calibration",
+    )
+    parser.add_argument("--seeds", type=int, default=3, help="surveys of each row")
+    parser.add_argument("--flights", type=int, default=3, help="flights that they share")
+    parser.add_argument("--log", nargs="+", choices=sorted(LOGS), default=["flown"])
+    parser.add_argument("--only", nargs="+", default=[], metavar="TEXT", help="rows with this text")
+    parser.add_argument(
+        "--pool-scale", type=int, default=4, help="pixels of the sensor in one of the pool's"
+    )
+    parser.add_argument("--far-port", action="store_true", help="ports at 100 mm, 2 deg tilted")
+    parser.add_argument("--adjust", metavar="MODULE:FUNCTION", help="instead of the pipeline's")
+    options, about = parser.begin("numpy", "scipy", "pycolmap")
+    options.cases = [
+        case for case in CASES if not options.only or any(t in case.name for t in options.only)
+    ]
+    if options.quick:
+        options.seeds, options.cases = 1, CASES[:2]
+    if options.adjust is None:
+        options.adjust = adjusted
+    else:
+        module, _, function = options.adjust.partition(":")
+        options.adjust = getattr(importlib.import_module(module), function)
     pycolmap.logging.minloglevel = 2
-    about = machine(("numpy", "scipy", "pycolmap"))
-    print(f"{heading(about)}\n", flush=True)
     example = _QUICK_EXAMPLE if options.quick else _EXAMPLE
-    options.work.mkdir(parents=True, exist_ok=True)
     rig = calibrated_rig(
         options.work, example, options.pool_scale, _SCALE, far_port=options.far_port
     )
@@ -238,33 +257,6 @@ def _figures(name: str, row: Score) -> list[Figure]:
         for ratio in ratios
         if np.isfinite(getattr(row, ratio))
     ]
-
-
-def _options() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--work", type=Path, required=True, help="keeps flights and calibration")
-    parser.add_argument("--seeds", type=int, default=3, help="surveys of each row")
-    parser.add_argument("--flights", type=int, default=3, help="flights that they share")
-    parser.add_argument("--log", nargs="+", choices=sorted(LOGS), default=["flown"])
-    parser.add_argument("--only", nargs="+", default=[], metavar="TEXT", help="rows with this text")
-    parser.add_argument(
-        "--pool-scale", type=int, default=4, help="pixels of the sensor in one of the pool's"
-    )
-    parser.add_argument("--far-port", action="store_true", help="ports at 100 mm, 2 deg tilted")
-    parser.add_argument("--adjust", metavar="MODULE:FUNCTION", help="instead of the pipeline's")
-    add_options(parser, quick="one survey of the demo, calibration as stated and 3 times worse")
-    options = parser.parse_args()
-    options.cases = [
-        case for case in CASES if not options.only or any(t in case.name for t in options.only)
-    ]
-    if options.quick:
-        options.seeds, options.cases = 1, CASES[:2]
-    if options.adjust is None:
-        options.adjust = adjusted
-    else:
-        module, _, function = options.adjust.partition(":")
-        options.adjust = getattr(importlib.import_module(module), function)
-    return options
 
 
 if __name__ == "__main__":

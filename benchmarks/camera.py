@@ -5,25 +5,24 @@
 Everything that is compared is measured in this run. Ends with exit code 1 when a goal is missed.
 """
 
-import argparse
 import sys
 from dataclasses import asdict
 from typing import Any
 
 from alice_survey.core.executor import local_executor
 from benchmarks import camera_calibration, camera_speed, target_calibration
-from benchmarks.figures import Findings, add_options, hand_over
-from benchmarks.machine import heading, machine
+from benchmarks.figures import Findings, Parser, hand_over
 
 _PARTS = ("speed", "calibration", "target")
 
 
 def main() -> None:
     """Measure, print, and say which goals are missed."""
-    options = _options()
-    packages = ("numpy", "numba", "opencv-contrib-python-headless", "pycolmap")
-    about, report, findings = machine(packages), dict[str, Any](), Findings()
-    print(heading(about), "\n", flush=True)
+    parser = Parser(__doc__, quick="fewer points and trials")
+    parser.add_argument("--only", nargs="+", choices=_PARTS, default=list(_PARTS))
+    parser.add_argument("--threads", type=int, default=1, help="processes for the trials")
+    options, about = parser.begin("numpy", "numba", "opencv-contrib-python-headless", "pycolmap")
+    report, findings = dict[str, Any](), Findings()
     if "speed" in options.only:
         rows = camera_speed.measure(
             20_000 if options.quick else 100_000, 10 if options.quick else 40
@@ -53,14 +52,6 @@ def main() -> None:
             figures=tuple(f for case in cases for f in case.figures(judged=not options.quick))
         )
     sys.exit(hand_over(options, about, findings, report))
-
-
-def _options() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description="Benchmarks of the camera.")
-    add_options(parser, quick="fewer points and trials")
-    parser.add_argument("--only", nargs="+", choices=_PARTS, default=list(_PARTS))
-    parser.add_argument("--threads", type=int, default=1, help="processes for the trials")
-    return parser.parse_args()
 
 
 if __name__ == "__main__":

@@ -14,7 +14,6 @@ Tasks and serial work grow with the pictures. `--smaller` names a recorded surve
 what is the same in both (a sum over the survey, a start, a cap) then does not grow.
 """
 
-import argparse
 import contextlib
 import shutil
 import subprocess
@@ -27,8 +26,7 @@ from alice_survey.app.stages import names, spec
 from alice_survey.core.artefacts import read_json
 from alice_survey.core.manifest import read_manifest
 from benchmarks.cluster_model import Network, RecordedStage, Recording, makespan, recorded
-from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
-from benchmarks.machine import heading, machine
+from benchmarks.figures import Figure, Findings, Goal, Parser, hand_over
 
 _WORKERS = (1, 2, 4, 8, 16, 32, 64, 128)
 _MEASURED = (1, 2)
@@ -137,10 +135,19 @@ def report_scaling(stages: Sequence[RecordedStage], network: Network) -> list[Fi
 
 def main() -> None:
     """Measure, replay, report."""
-    options = _options()
-    about = machine(("alice-survey", "distributed"))
-    print(f"{heading(about)}\n", flush=True)
-    options.work.mkdir(parents=True, exist_ok=True)
+    parser = Parser(
+        __doc__, quick="nothing: the demo is the smallest survey", work="keeps surveys and events"
+    )
+    parser.add_argument("--survey", type=Path, help="a workspace with calibrated pictures")
+    parser.add_argument("--events", type=Path, help="of a reconstruction that was made before")
+    parser.add_argument("--pictures", type=int, help="of the survey that is modelled")
+    parser.add_argument(
+        "--smaller", type=Path, nargs=2, metavar=("WORKSPACE", "EVENTS"),
+        help="a reconstruction of another size",
+    )  # fmt: skip
+    options, about = parser.begin("alice-survey", "distributed")
+    if options.events is not None and options.pictures is not None and options.survey is None:
+        parser.error("--pictures with --events needs the --survey that they are of")
     network = Network(task_s=task_cost_s(options.work))
     print(f"an empty task: {1e3 * network.task_s:.2f} ms")
     figures = [Figure(name="an empty task", value=1e3 * network.task_s, unit="ms")]
@@ -170,23 +177,6 @@ def main() -> None:
         print(f"{known} pictures recorded, {options.pictures} modelled")
     figures += report_scaling(stages, network)
     sys.exit(hand_over(options, about, Findings(figures=tuple(figures))))
-
-
-def _options() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--work", type=Path, required=True, help="keeps surveys and events")
-    parser.add_argument("--survey", type=Path, help="a workspace with calibrated pictures")
-    parser.add_argument("--events", type=Path, help="of a reconstruction that was made before")
-    parser.add_argument("--pictures", type=int, help="of the survey that is modelled")
-    parser.add_argument(
-        "--smaller", type=Path, nargs=2, metavar=("WORKSPACE", "EVENTS"),
-        help="a reconstruction of another size",
-    )  # fmt: skip
-    add_options(parser, quick="nothing: the demo is the smallest survey")
-    options = parser.parse_args()
-    if options.events is not None and options.pictures is not None and options.survey is None:
-        parser.error("--pictures with --events needs the --survey that they are of")
-    return options
 
 
 if __name__ == "__main__":

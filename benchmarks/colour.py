@@ -12,7 +12,6 @@ a cell of 4 x 4 pixels, its mean linear light is compared with the mean reflecta
 away. "water, card" knows a grey card of two patches from one picture. Pictures in FOLDER are kept.
 """
 
-import argparse
 import shutil
 import sys
 from collections.abc import Mapping, Sequence
@@ -34,8 +33,7 @@ from alice_survey.core.frames import Array
 from benchmarks.colour_difference import delta_e_2000, lab_from_rgb
 from benchmarks.colour_peers import grey_world, sea_thru
 from benchmarks.colour_survey import ColourSurvey, card_rows, from_above, write_survey
-from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
-from benchmarks.machine import heading, machine
+from benchmarks.figures import Figure, Findings, Goal, Parser, hand_over
 from reconstruct.mosaic.picture_measures import encode_srgb, linear_table
 
 PIXEL_M, CELL_PX = 0.004, 4
@@ -168,15 +166,15 @@ def figures(where: str, found: Mapping[str, Difference], *, quick: bool) -> tupl
 
 def main() -> int:
     """Print a row for each water and method."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--work", type=Path, required=True, help="keeps pictures and mosaics")
+    parser = Parser(
+        __doc__,
+        quick="two lines of six pictures in the first water",
+        work="keeps pictures and mosaics",
+    )
     parser.add_argument("--water", nargs="+", default=["II", "3C"], help="Jerlov types")
     parser.add_argument("--relief", nargs="+", type=float, default=[1.2, 0.35], help="metres")
     parser.add_argument("--only", nargs="+", default=METHODS, choices=METHODS)
-    add_options(parser, quick="two lines of six pictures in the first water")
-    options = parser.parse_args()
-    about = machine(("numpy", "opencv-contrib-python-headless"))
-    print(f"{heading(about)}\n")
+    options, about = parser.begin("numpy", "opencv-contrib-python-headless")
     findings = Findings()
     cases = [(jerlov, relief_m) for relief_m in options.relief for jerlov in options.water]
     for jerlov, relief_m in cases[:1] if options.quick else cases:

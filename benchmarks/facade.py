@@ -11,7 +11,6 @@ with the facade's closed form. PYTHON has Mitsuba (`pip install mitsuba`, BSD-3-
 that are in FOLDER/photos are not rendered again. `--judge` only judges what is there.
 """
 
-import argparse
 import json
 import shutil
 import subprocess
@@ -30,11 +29,10 @@ from scipy.spatial.transform import Rotation
 from alice_survey.core.artefacts import read_json
 from alice_survey.core.frames import Array
 from benchmarks import facade_scene as scene
-from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over, plain
+from benchmarks.figures import Figure, Findings, Goal, Parser, hand_over, plain
 from benchmarks.harbour_judge import face_points, spread
 from benchmarks.harbour_mosaic import PATCH_PX, plane_points_ned, shift_px, windows_in
 from benchmarks.harbour_survey import command
-from benchmarks.machine import heading, machine
 from benchmarks.measured import measured
 from reconstruct.evaluate.scores import read_mesh
 from reconstruct.placing.alignment import Similarity, align_similarity
@@ -52,14 +50,14 @@ _ALL_POINTS = 2**40
 
 def main() -> None:
     """Render, reconstruct, judge; the exit code is 1 when a goal is missed."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--work", type=Path, required=True, help="keeps pictures and workspace")
+    parser = Parser(
+        __doc__,
+        quick="every second picture of the upper row is left out",
+        work="keeps pictures and workspace",
+    )
     parser.add_argument("--mitsuba", help="a Python that has Mitsuba")
     parser.add_argument("--judge", action="store_true", help="judge the workspace that is there")
-    add_options(parser, quick="every second picture of the upper row is left out")
-    options = parser.parse_args()
-    about = machine(("numpy", "open3d"))
-    print(f"{heading(about)}\n", flush=True)
+    options, about = parser.begin("numpy", "open3d")
     cameras = scene.cameras()
     if options.quick:
         cameras = [c for n, c in enumerate(cameras) if n < 9 or n % 2]

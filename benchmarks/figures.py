@@ -17,7 +17,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from benchmarks.machine import load
+from benchmarks.machine import heading, load, machine
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,23 +108,51 @@ class Findings:
         return [figure.miss() for figure in self.figures if figure.met is False]
 
 
-def add_options(parser: argparse.ArgumentParser, quick: str) -> None:
-    """The options that every benchmark has; `quick` says what `--quick` leaves out."""
-    parser.add_argument("--quick", action="store_true", help=quick)
-    parser.add_argument("--json", type=Path, help="write all figures to this file")
+class Parser(argparse.ArgumentParser):
+    """The options that every benchmark has."""
+
+    def __init__(self, doc: str | None, *, quick: str, work: str = "") -> None:
+        """A parser.
+
+        Args:
+            doc: of the benchmark; its first line counts.
+            quick: what `--quick` leaves out.
+            work: what the folder of `--work` is for, where one is needed.
+        """
+        super().__init__(description=(doc or "").splitlines()[0])
+        self.add_argument("--quick", action="store_true", help=quick)
+        self.add_argument("--json", type=Path, help="write all figures to this file")
+        if work:
+            self.add_argument("--work", type=Path, required=True, help=work)
+
+    def begin(self, *packages: str) -> tuple[argparse.Namespace, dict[str, Any]]:
+        """Read the options, make the folder to work in, and print what it runs on.
+
+        Args:
+            packages: whose versions count.
+
+        Returns:
+            The options, and what `machine` knows.
+        """
+        options = self.parse_args()
+        if "work" in options:
+            options.work.mkdir(parents=True, exist_ok=True)
+        about = machine(packages)
+        print(f"{heading(about)}\n", flush=True)
+        return options, about
 
 
 def hand_over(
     options: argparse.Namespace,
-    machine: Mapping[str, Any],
+    about: Mapping[str, Any],
     findings: Findings,
     rows: Mapping[str, Any] | None = None,
 ) -> int:
     """Print load, figures, what was left out, missed and failed; write the JSON where requested.
 
     Args:
-        options: with those of `add_options`.
-        machine: as `benchmarks.machine.machine` has it, from before the work.
+        options: of a `Parser`.
+        about: as `benchmarks.machine.machine` has it, from before the work.
         findings: all of them.
         rows: what else to keep, by name.
 
@@ -134,7 +162,7 @@ def hand_over(
     print(f"load after: {load()}")
     if options.json is not None:
         report = {
-            "machine": dict(machine),
+            "machine": dict(about),
             "quick": options.quick,
             "figures": [_as_row(figure) for figure in findings.figures],
             "missed": findings.missed,

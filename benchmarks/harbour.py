@@ -10,7 +10,6 @@ takes them as they are), imported and reconstructed by the two commands a user t
 FOLDER/survey, and compared with the harbour's closed form. `--judge` only judges what is there.
 """
 
-import argparse
 import json
 import shutil
 import sys
@@ -18,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from alice_survey.core.executor import local_executor
-from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over, plain
+from benchmarks.figures import Figure, Findings, Goal, Parser, hand_over, plain
 from benchmarks.harbour_judge import judge, true_harbour
 from benchmarks.harbour_survey import (
     Shoot,
@@ -27,7 +26,6 @@ from benchmarks.harbour_survey import (
     render_survey,
     stations,
 )
-from benchmarks.machine import heading, machine
 from benchmarks.measured import measured
 
 _GOALS = {
@@ -45,15 +43,15 @@ _GOALS = {
 
 def main() -> None:
     """Render, reconstruct, judge; the exit code is 1 when a goal is missed."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--work", type=Path, required=True, help="keeps pictures and workspace")
+    parser = Parser(
+        __doc__,
+        quick="16 stations before the wall at a twelfth of the resolution",
+        work="keeps pictures and workspace",
+    )
     parser.add_argument("--step", type=float, default=0.3, help="between stations of a row, metres")
     parser.add_argument("--scale", type=int, default=8, help="sensor's pixels to one of a picture")
     parser.add_argument("--judge", action="store_true", help="judge the workspace that is there")
-    add_options(parser, quick="16 stations before the wall at a twelfth of the resolution")
-    options = parser.parse_args()
-    about = machine(("numpy", "open3d"))
-    print(f"{heading(about)}\n", flush=True)
+    options, about = parser.begin("numpy", "open3d")
     planned = tuple(quick_stations() if options.quick else stations(options.step))
     scale = 12 if options.quick else options.scale
     shoot = Shoot(folder=options.work / "pictures", planned=planned, scale=scale)

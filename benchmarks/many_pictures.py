@@ -11,7 +11,6 @@ an unfinished stage takes on disk. Heights of all copies are compared with those
 What mapping costs is measured with synthetic tracks (`benchmarks.scale_steps`).
 """
 
-import argparse
 import math
 import os
 import shutil
@@ -44,8 +43,7 @@ from alice_survey.core.artefacts import (
 )
 from alice_survey.core.frames import Array
 from alice_survey.core.manifest import ImageRecord, read_manifest, write_manifest
-from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
-from benchmarks.machine import heading, machine
+from benchmarks.figures import Figure, Findings, Goal, Parser, hand_over
 from benchmarks.measured import python
 from benchmarks.reconstruct_surveys import demo_like, render
 from benchmarks.scale import growth, measure
@@ -395,9 +393,13 @@ def figures_of(rows: Sequence[StageCost], *, judged: bool) -> list[Figure]:
 
 def main() -> None:
     """Print the table."""
-    options = _options()
-    about = machine(("numpy", "scipy", "opencv-contrib-python-headless", "rasterio"))
-    print(f"{heading(about)}\n\n{'stage':<8}{'pictures':>9}{'s':>9}{'wall s':>9}{'parent':>8}"
+    parser = Parser(__doc__, quick="90 pictures", work="keeps surveys and results")
+    parser.add_argument("--pictures", type=int, nargs="+", default=[400, 2000, 10000], metavar="N")
+    parser.add_argument("--threads", type=int, default=2, help="workers")
+    options, about = parser.begin("numpy", "scipy", "opencv-contrib-python-headless", "rasterio")
+    if options.quick:
+        options.pictures = [80]
+    print(f"{'stage':<8}{'pictures':>9}{'s':>9}{'wall s':>9}{'parent':>8}"
           f"{'worker':>8}{'disk GiB':>10}{'files':>9}{'open':>6}", flush=True)  # fmt: skip
     tile = make_tile(options.work)
     own = len(read_manifest(tile / "images" / "manifest.csv"))
@@ -425,18 +427,6 @@ def main() -> None:
     kept = {stage: [asdict(row) for row in of_stage] for stage, of_stage in rows.items()}
     findings = Findings(figures=tuple(figures), failed=tuple(failed))
     sys.exit(hand_over(options, about, findings, {"stages": kept}))
-
-
-def _options() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--work", type=Path, required=True, help="keeps surveys and results")
-    parser.add_argument("--pictures", type=int, nargs="+", default=[400, 2000, 10000], metavar="N")
-    parser.add_argument("--threads", type=int, default=2, help="workers")
-    add_options(parser, quick="90 pictures")
-    options = parser.parse_args()
-    if options.quick:
-        options.pictures = [80]
-    return options
 
 
 if __name__ == "__main__":

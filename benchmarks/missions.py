@@ -7,36 +7,45 @@ by COLA2 alone, since ArduSub needs thrusters sideways) fly each format in curre
 the lines, with gusts and sensors as by default. Each mission is exported again with its current as
 the expected one. For each: cross-track rms on lines, ends of lines overshot, and how much of the
 area is seen at the requested overlap, next to the plan's certificate, and where the export warned.
+
+A survey of 5 x 2 m is planned over floors that a bathymetry holds: flat, slopes and a wall. ALICE
+flies its missions over them, with sand and rocks on top, in still water and 0.1 m/s across, or
+their export is refused. Nothing may touch.
 """
 
-import argparse
+import itertools
 import math
 import sys
 import tempfile
-from dataclasses import asdict, dataclass
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import rasterio
+from pyproj import Transformer
 
-from alice_survey.core.config import SurveyConfig, change_section
-from alice_survey.core.errors import keep_warnings
-from alice_survey.kit.words import text_table
+from alice_survey.core.config import AreaConfig, SurveyConfig, change_section, parse_config
+from alice_survey.core.errors import PlanError, keep_warnings
+from alice_survey.core.frames import Array
+from alice_survey.core.records import FlightRecord
 from alice_survey.sim.vehicle.sea import level_floor
-from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
-from benchmarks.machine import heading, machine
-from camera_calib.rig import Rig, design_rig
-from missions.coverage.certificate import certificate
-from missions.coverage.stations import plan_pattern, stations_of_flight
+from benchmarks.figures import Figure, Findings, Goal, Parser, hand_over, markdown, number
+from camera_calib.rig import design_rig
 from missions.exports.format import options_of
 from missions.exports.write import write_exports
+from missions.fly.run import flight_summary
 from missions.fly.simulation import (
     PASSED_M,
     flight_settings,
     mission_of_settings,
     overshoot_m,
     simulate_mission,
+    true_floor,
 )
 from missions.plan.planner import plan_survey
+from missions.stages import FLY
 from missions.values.flight import rms
 from missions.values.plan_file import Plan
 
@@ -45,52 +54,104 @@ FORMATS = {
     "wpl": "mission_dive1.waypoints",
     "qgc": "mission_dive1.plan",
 }
+_LEVEL = "level"
+_UTM = "EPSG:32636"
 _SPARE = 0.02
 """How much less than promised may be seen: navigation and gusts."""
+
+
+_SEAS = [(0.0, False), (0.1, False), (0.1, True), (0.2, False), (0.2, True)]
+_SMALL = {"length_m": 5.0, "width_m": 2.0, "heading_deg": 0.0, "seafloor_depth_m": 16.0}
+_CELL_M, _CELLS = 0.25, 240
+_FLOORS: dict[str, Callable[[Array, Array], Array]] = {
+    "flat": lambda north, east: 0.0 * north,
+    "8.5 deg along the lines": lambda north, east: 0.15 * north,
+    "30 deg along the lines": lambda north, east: math.tan(math.radians(30.0)) * north,
+    "6 m wall across the lines": lambda north, east: 6.0 * (north > 2.5),
+    "6 m wall along the lines": lambda north, east: 6.0 * (east > 2.7),
+}
+"""How far they rise above 16 m."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
     """One flown mission."""
 
+    floor: str
+    """Level, or one of `_FLOORS`."""
     vehicle: str
     format: str
     current_mps: float
     across: bool
     ending: str
-    cross_track_rms_m: float
-    line_ends: int
-    overshot: int
+    """Or why the export was refused."""
     promised: float
     """Share of the area at the requested overlap by the plan's certificate."""
-    warned: bool
+    cross_track_rms_m: float = math.nan
+    line_ends: int = 0
+    overshot: int = 0
+    warned: bool = False
     """Whether the export warned that the promise would not be kept."""
-    flown: float
+    flown: float = math.nan
+    clearance_m: float = math.nan
+    """Least of hull, port and DVL."""
+    outside_m: float = math.nan
+    """Farthest that the left port was out of the allowed area."""
+    shortfall: str = ""
+    """Why `fly` ends with exit code 3, though the vehicle stayed in its area; empty with 0."""
+
+    @property
+    def sea(self) -> str:
+        """In words."""
+        if self.current_mps == 0.0:
+            return "still"
+        return f"{self.current_mps:g} m/s {'across' if self.across else 'along'}"
 
     def figure(self) -> Figure:
-        """What is seen, and as its goal what is promised, unless less was said beforehand."""
+        """What is seen of what is promised, unless less was said; over terrain the clearance."""
+        name = f"{self.vehicle}, {self.format}, {self.sea}"
+        if self.floor != _LEVEL:
+            above = Goal(minimum=0.1)
+            return Figure(
+                name=f"{self.floor}, {name}", value=self.clearance_m, unit="m", goal=above
+            )
         goal = None if self.warned else Goal(minimum=100.0 * (self.promised - _SPARE))
-        return Figure(
-            name=f"{self.vehicle}, {self.format}, {_sea(self)}: at the requested overlap",
-            value=100.0 * self.flown,
-            unit="%",
-            goal=goal,
-        )
+        seen = 100.0 * self.flown
+        return Figure(name=f"{name}: at the requested overlap", value=seen, unit="%", goal=goal)
+
+    def cells(self) -> dict[str, str]:
+        """A row of the table."""
+        shares = {
+            "promised %": f"{100 * self.promised:.1f}{', warned' if self.warned else ''}",
+            "flown %": number(100 * self.flown),
+        }
+        if self.floor == _LEVEL:
+            return {
+                "vehicle": self.vehicle, "format": f"`{self.format}`", "current": self.sea,
+                "cross-track rms m": f"{self.cross_track_rms_m:.2f}",
+                "line ends overshot": f"{self.overshot} of {self.line_ends}", **shares,
+            }  # fmt: skip
+        return {
+            "floor": self.floor, "format": f"`{self.format}`", "current": self.sea,
+            "least clearance m": number(self.clearance_m), **shares,
+            "out of the area m": number(self.outside_m), "outcome": self.shortfall or self.ending,
+        }  # fmt: skip
 
 
 def main() -> None:
-    """Fly all, print the table, and say which missions see less than was said."""
-    options = _options()
-    about = machine(("numpy", "numba", "scipy"))
-    print(heading(about), "\n", flush=True)
-    rows = measure(quick=options.quick)
-    print(table(rows), flush=True)
+    """Fly all, print the tables, and say which missions see less than was said, or touch."""
+    parser = Parser(__doc__, quick="two formats, two currents, two floors")
+    options, about = parser.begin("numpy", "numba", "scipy")
+    rows = [*measure(quick=options.quick), *over_terrain(quick=options.quick)]
+    for is_level in (True, False):
+        own = [row.cells() for row in rows if (row.floor == _LEVEL) == is_level]
+        print(*markdown(own), sep="\n", flush=True)
     findings = Findings(
-        figures=tuple(row.figure() for row in rows),
+        figures=tuple(row.figure() for row in rows if math.isfinite(row.flown)),
         failed=tuple(
-            f"{r.vehicle}, {r.format}, {_sea(r)}: {r.ending}"
+            f"{r.vehicle}, {r.format}, {r.sea}: {r.ending}"
             for r in rows
-            if r.ending != "complete"
+            if r.floor == _LEVEL and r.ending != "complete"
         ),
     )
     sys.exit(hand_over(options, about, findings, {"rows": [asdict(row) for row in rows]}))
@@ -99,75 +160,95 @@ def main() -> None:
 def measure(*, quick: bool) -> list[Row]:
     """Fly every format in every current."""
     config = change_section(SurveyConfig(), "sea", current_sigma_mps=0.0)
-    rig = design_rig(config.camera, config.water)
-    plan = plan_survey(config, rig).plan
-    along_deg = math.degrees(plan.lines[0].heading_rad) % 360.0
+    plan = _planned(config)
     seas = [(0.0, False), (0.1, True)] if quick else _SEAS
     rows = []
     for vehicle in ("alice", "sparus2"):
         flown = ("cola2",) if vehicle == "sparus2" else (("cola2", "qgc") if quick else FORMATS)
         for current, across in seas:
-            towards = (along_deg + (90.0 if across else 0.0)) % 360.0
-            at = change_section(config, "sea", current_mps=current, current_towards_deg=towards)
+            at = _in_sea(config, plan, current, across=across)
             at = change_section(at, "vehicle", name=vehicle)
-            rows += [_fly(plan, rig, at, name, across=across) for name in flown]
+            rows += [_fly(plan, at, name, across=across) for name in flown]
     return rows
 
 
-_SEAS = [(0.0, False), (0.1, False), (0.1, True), (0.2, False), (0.2, True)]
-
-
-def _fly(plan: Plan, rig: Rig, config: SurveyConfig, name: str, *, across: bool) -> Row:
+def over_terrain(*, quick: bool) -> list[Row]:
+    """Fly every format over every floor, in still water and in a current across."""
+    rows = []
     with tempfile.TemporaryDirectory() as folder:
+        for name in [*_FLOORS][1::2] if quick else _FLOORS:
+            raster = Path(folder) / "floor.tif"
+            _write_floor(raster, _FLOORS[name])
+            config = parse_config({"area": {**_SMALL, "bathymetry_file": raster}}, "missions")
+            plan = _planned(config)
+            for current, kind in itertools.product((0.0, 0.1), FORMATS):
+                at = _in_sea(config, plan, current, across=True)
+                rows.append(_fly(plan, at, kind, across=True, floor_name=name))
+    return rows
+
+
+def _write_floor(path: Path, rise: Callable[[Array, Array], Array]) -> None:
+    """A GeoTIFF of depths, in UTM, with the datum of the area in its middle."""
+    area, half_m = AreaConfig(), 0.5 * _CELLS * _CELL_M
+    places = (np.arange(_CELLS) + 0.5) * _CELL_M - half_m
+    depth = _SMALL["seafloor_depth_m"] - rise(*np.meshgrid(-places, places, indexing="ij"))
+    to_utm = Transformer.from_crs("EPSG:4326", _UTM, always_xy=True)
+    x, y = to_utm.transform(area.longitude_deg, area.latitude_deg)
+    corner = rasterio.transform.from_origin(x - half_m, y + half_m, _CELL_M, _CELL_M)
+    size: dict[str, Any] = {"width": _CELLS, "height": _CELLS, "count": 1, "dtype": "float64"}
+    with rasterio.open(path, "w", driver="GTiff", crs=_UTM, transform=corner, **size) as file:
+        file.write(depth, 1)
+        file.update_tags(1, positive="down")
+
+
+def _planned(config: SurveyConfig) -> Plan:
+    return plan_survey(config, design_rig(config.camera, config.water)).plan
+
+
+def _in_sea(config: SurveyConfig, plan: Plan, current: float, *, across: bool) -> SurveyConfig:
+    """The survey in a current along or across its lines."""
+    towards = math.degrees(plan.lines[0].heading_rad) + (90.0 if across else 0.0)
+    return change_section(config, "sea", current_mps=current, current_towards_deg=towards % 360.0)
+
+
+def _fly(
+    plan: Plan, config: SurveyConfig, name: str, *, across: bool, floor_name: str = _LEVEL
+) -> Row:
+    rig, area = design_rig(config.camera, config.water), config.area
+    row = Row(
+        floor=floor_name, vehicle=config.vehicle.name, format=name, across=across, ending="",
+        current_mps=config.sea.current_mps, promised=plan.coverage,
+    )  # fmt: skip
+    with tempfile.TemporaryDirectory() as directory:
+        folder = Path(directory)
         options = options_of(config.camera, config.plan, config.vehicle, config.sea)
-        with keep_warnings() as warnings:
-            write_exports(Path(folder), plan, rig, formats=[name], options=options)
-        config = change_section(config, "vehicle", mission_file=Path(folder) / FORMATS[name])
+        try:
+            with keep_warnings() as warnings:
+                write_exports(folder, plan, rig, formats=[name], options=options)
+        except PlanError as error:
+            return replace(row, ending=f"refused: {error}")
+        config = change_section(config, "vehicle", mission_file=folder / FORMATS[name])
         settings = flight_settings(config)
-        floor = level_floor(config.area.seafloor_depth_m)
+        is_level = area.bathymetry_file is None
+        floor = level_floor(area.seafloor_depth_m) if is_level else true_floor(plan, settings)
         flight = simulate_mission(plan, settings, floor, np.random.default_rng(7), label="")
         beyond_m = overshoot_m(mission_of_settings(plan, settings), flight)
-    seen = certificate(plan.area, rig, stations_of_flight(flight), plan_pattern(plan, rig))
-    return Row(
-        vehicle=config.vehicle.name,
-        format=name,
-        current_mps=config.sea.current_mps,
-        across=across,
+        summary = flight_summary(flight, config.vehicle, rig)
+        outside_m, summary["outside_allowed"]["worst_m"] = float(flight.outside_m.max()), 0.0
+        FlightRecord.save(folder / "flight.json", summary)
+        shortfall = FLY.shortfall(folder)
+    return replace(
+        row,
         ending=flight.ending,
         cross_track_rms_m=rms(flight.line_errors[0]),
         line_ends=len(beyond_m),
         overshot=sum(beyond > PASSED_M for beyond in beyond_m),
-        promised=plan.coverage,
         warned=any("COLA2 holds" in text for text in warnings),
-        flown=seen.share_at_overlap,
+        flown=summary["coverage"]["share_at_overlap"],
+        clearance_m=flight.clearance_m,
+        outside_m=outside_m,
+        shortfall=shortfall,
     )
-
-
-def _sea(row: Row) -> str:
-    if row.current_mps == 0.0:
-        return "still"
-    return f"{row.current_mps:g} m/s {'across' if row.across else 'along'}"
-
-
-def table(rows: list[Row]) -> str:
-    """The rows as a table."""
-    header = ("vehicle", "format", "current", "cross-track rms m", "line ends overshot",
-              "promised %", "flown %", "ending")  # fmt: skip
-    return text_table(header, [
-        (
-            row.vehicle, row.format, _sea(row), f"{row.cross_track_rms_m:.2f}",
-            f"{row.overshot} of {row.line_ends}",
-            f"{100 * row.promised:.1f}{', warned' if row.warned else ''}",
-            f"{100 * row.flown:.1f}", row.ending,
-        )
-        for row in rows
-    ])  # fmt: skip
-
-
-def _options() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description="Exported missions as autopilots fly them.")
-    add_options(parser, quick="two formats, two currents")
-    return parser.parse_args()
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ Memory is the largest sum over the process and all its children (proportional se
 makes 50 megapixels alone.
 """
 
-import argparse
 import os
 import shutil
 import sys
@@ -24,8 +23,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.artefacts import write_csv, write_json
 from alice_survey.core.frames import BODY_FROM_NADIR_CAM, Array, Datum
-from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
-from benchmarks.machine import heading, machine
+from benchmarks.figures import Figure, Findings, Goal, Parser, hand_over
 from benchmarks.measured import Cost, measured, python
 from camera_calib.approximation.pinhole_warp import best_warp
 from camera_calib.camera import Camera
@@ -192,14 +190,11 @@ def measure(work: Path, megapixels: float, threads: int) -> Measured:
 
 def main() -> int:
     """Print a line for each area; fail where memory is above the promise."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--work", type=Path, required=True, help="folder for the surveys")
+    parser = Parser(__doc__, quick="50 megapixels alone", work="folder for the surveys")
     parser.add_argument("--megapixels", type=float, nargs="+", default=[50.0, 200.0, 1000.0])
     parser.add_argument("--threads", type=int, default=2, help="each takes up to 400 MiB")
-    add_options(parser, quick="50 megapixels alone")
-    options = parser.parse_args()
-    about, findings = machine(_PACKAGES), Findings()
-    print(f"{heading(about)}\n")
+    options, about = parser.begin(*_PACKAGES)
+    findings = Findings()
     for megapixels in [50.0] if options.quick else options.megapixels:
         found = measure(options.work, megapixels, options.threads)
         findings += found.findings()

@@ -41,8 +41,6 @@ class Part:
     """Whether it takes more than ten minutes on two cores."""
     packages: Sequence[str] = ()
     """Of the extra `bench`, by the names that are imported, that it cannot do without."""
-    pictures: str = ""
-    """Folder of real pictures without which it cannot run; not with `--quick`."""
     needs_mitsuba: bool = False
 
     @property
@@ -67,17 +65,12 @@ class Part:
         missing = [name for name in self.packages if importlib.util.find_spec(name) is None]
         if missing:
             return f"{', '.join(missing)} missing: install the extra `bench`"
-        if self.pictures and settings.quick:
-            return "--quick: takes minutes at its smallest; real-pictures has a smaller set"
-        if self.pictures and not (settings.data / self.pictures).is_dir():
-            return f"no pictures in {settings.data / self.pictures}"
         if self.needs_mitsuba and settings.mitsuba is None:
             return "no --mitsuba PYTHON to render it with"
         return None
 
 
 _WORK = ("work",)
-_SURVEY = ("work", "data", "pyorthomosaic")
 PARTS = (
     Part(name="camera-speed", module="camera", arguments="--only speed"),
     Part(name="camera-pose", module="camera", arguments="--only pose"),
@@ -93,6 +86,7 @@ PARTS = (
     Part(name="studio"),
     Part(name="vehicle"),
     Part(name="missions"),
+    Part(name="faults", packages=("rclpy",)),
     Part(name="refraction"),
     Part(name="bend", passes=_WORK),
     Part(name="precision", passes=_WORK, long=True),
@@ -113,22 +107,6 @@ PARTS = (
         arguments="--only growth",
         passes=_WORK,
         long=True,
-    ),
-    Part(
-        name="reconstruct-haltbrekken",
-        module="reconstruct",
-        arguments="--only haltbrekken",
-        passes=_SURVEY,
-        long=True,
-        pictures="haltbrekken",
-    ),
-    Part(
-        name="reconstruct-brighton",
-        module="reconstruct",
-        arguments="--only brighton",
-        passes=_SURVEY,
-        long=True,
-        pictures="brighton_beach",
     ),
     Part(name="harbour", passes=_WORK, long=True),
     Part(name="facade", passes=("work", "mitsuba"), long=True, needs_mitsuba=True),

@@ -7,7 +7,6 @@ A peer is left out above 300 rows where it would take minutes. Ends with exit co
 missed. `--angles` compares the heading that is found with the best of many (3,600), at full cost.
 """
 
-import argparse
 import math
 import sys
 import time
@@ -17,8 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
-from benchmarks.machine import heading, machine
+from benchmarks.figures import Figure, Findings, Goal, Parser, hand_over
 from benchmarks.planner_areas import planned_area, shapes
 from benchmarks.planner_peers import (
     MARGIN_M,
@@ -53,9 +51,10 @@ _MAX_S = (10_000, 1.0)
 
 def main() -> None:
     """Measure, print, and say which goals are missed."""
-    options = _options()
-    about, figures = machine(("numpy", "numba", "shapely", "coverage-path-planner")), list[Figure]()
-    print(heading(about), "\n", flush=True)
+    parser = Parser(__doc__, quick="fewer rows and headings, smaller areas")
+    parser.add_argument("--angles", action="store_true", help="search headings, not lines")
+    options, about = parser.begin("numpy", "numba", "shapely", "coverage-path-planner")
+    figures = list[Figure]()
     report: dict[str, Any] = {}
     if options.angles:
         for name in shapes():
@@ -160,13 +159,6 @@ def _angle_figures(name: str, *, quick: bool) -> Iterator[Figure]:
         peer_value=width_m, goal=Goal(maximum=width_m + 1e-9),
     )  # fmt: skip
     yield Figure(name=f"{name}: search for the heading", value=seconds, unit="s")
-
-
-def _options() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description="Benchmarks of the planner.")
-    add_options(parser, quick="fewer rows and headings, smaller areas")
-    parser.add_argument("--angles", action="store_true", help="search headings, not lines")
-    return parser.parse_args()
 
 
 if __name__ == "__main__":

@@ -12,7 +12,6 @@ off the bend what was said. FOLDER keeps the
 calibration.
 """
 
-import argparse
 import sys
 import time
 from dataclasses import dataclass, replace
@@ -30,8 +29,7 @@ from benchmarks import bend_survey
 from benchmarks.bend import score
 from benchmarks.bend_pipeline import adjusted
 from benchmarks.bend_survey import Fault, FlownTrack, calibrated_rig, drawn, start, wrong_rig
-from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
-from benchmarks.machine import heading, machine
+from benchmarks.figures import Figure, Findings, Goal, Parser, hand_over
 from camera_calib.rig import Rig
 from missions.plan.planner import plan_survey
 from missions.plan.strength import survey_costs
@@ -198,19 +196,18 @@ def compare(config: SurveyConfig, rig: Rig, seeds: range) -> Compared:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--work", type=Path, required=True, help="keeps the calibration")
+    parser = Parser(
+        __doc__,
+        quick="four surveys of the square without cross lines",
+        work="keeps the calibration",
+    )
     parser.add_argument("--seeds", type=int, default=30, help="surveys of each plan")
     parser.add_argument("--only", nargs="+", default=[], metavar="TEXT", help="shapes")
-    add_options(parser, quick="four surveys of the square without cross lines")
-    options = parser.parse_args()
+    options, about = parser.begin("numpy", "scipy", "pycolmap")
     shapes = [s for s in SHAPES if not options.only or any(t in s.name for t in options.only)]
     if options.quick:
         options.seeds, shapes = 4, [SHAPES[-1]]
     pycolmap.logging.minloglevel = 2
-    about = machine(("numpy", "scipy", "pycolmap"))
-    print(heading(about))
-    options.work.mkdir(parents=True, exist_ok=True)
     settings, rig = (
         bend_survey.example_config(options.work, "caesarea"),
         calibrated_rig(options.work, "caesarea", 4, 8),

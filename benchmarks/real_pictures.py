@@ -7,7 +7,6 @@ similarity alignment, since neither has a measured scale. Workspaces of the same
 again, so that times are those of the whole. `--quick` reconstructs a few pictures of a third set.
 """
 
-import argparse
 import json
 import shutil
 import subprocess
@@ -21,8 +20,7 @@ from pyproj import Transformer
 from scipy.spatial import cKDTree
 
 from alice_survey.core.frames import Array
-from benchmarks.figures import Figure, Findings, add_options, hand_over
-from benchmarks.machine import heading, machine
+from benchmarks.figures import Figure, Findings, Parser, hand_over
 from reconstruct.placing.alignment import align_similarity
 from reconstruct.views.model import read_frame
 
@@ -128,13 +126,11 @@ def against_cloud(drone: Path, workspace: Path) -> Findings:
 
 def main() -> int:
     """Run the sets that are there and print the figures."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = Parser(
+        __doc__, quick=f"{_QUICK_PICTURES} pictures of the smallest set", work="folder to work in"
+    )
     parser.add_argument("--data", type=Path, required=True, help="folder of the sets")
-    parser.add_argument("--work", type=Path, required=True, help="folder to work in")
-    add_options(parser, quick=f"{_QUICK_PICTURES} pictures of the smallest set")
-    options = parser.parse_args()
-    about = machine(_PACKAGES)
-    print(f"{heading(about)}\n", flush=True)
+    options, about = parser.begin(*_PACKAGES)
     sets = {"caliterra": run_few} if options.quick else {
         "haltbrekken": run_stereo, "brighton_beach": run_drone,
     }  # fmt: skip

@@ -1,9 +1,8 @@
 """Reconstruction next to stock COLMAP and pyOrthomosaic on the same pictures, in one run.
 
-    .venv/bin/python -m benchmarks.reconstruct --work FOLDER [--data ../shared/data]
-        [--demo WORKSPACE] [--pyorthomosaic PYTHON] [--limit SECONDS]
-        [--only peers,growth,hierarchical,haltbrekken,brighton] [--pictures 50,100]
-        [--sparse] [--large 400] [--quick] [--json FILE]
+    .venv/bin/python -m benchmarks.reconstruct --work FOLDER [--demo WORKSPACE]
+        [--pyorthomosaic PYTHON] [--limit SECONDS] [--only peers,growth,hierarchical]
+        [--pictures 50,100] [--sparse] [--large 400] [--quick] [--json FILE]
 
 `peers`: rendered pictures of the demo (quarter resolution), 50 and 100 by default. Wall and
 processor time, peak memory with children, pictures registered, and errors against the truth. Our
@@ -13,31 +12,24 @@ Ours runs on a few pictures first, so that its kernels are compiled, as the othe
 `growth`: our own cost on 50, 100, 200 and 400 pictures at an eighth of the resolution.
 `hierarchical`: to the sparse model of the first 400 (`--large`) of these, next to COLMAP's
 hierarchical and global mappers, which match neighbours by navigation.
-`haltbrekken`, `brighton`: real pictures of the folder given by `--data`; a picture of both
-mosaics side by side, and the distance from another tool's cloud.
 
 pyOrthomosaic (MIT licence, PyPI) is in the extra `bench`; `--pyorthomosaic` names the Python of
 another environment that has it. What is not there is left out, and said.
 """
 
-import argparse
 import json
 import subprocess
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-import cv2
-import numpy as np
-
-from benchmarks.figures import Figure, Findings, add_options, hand_over
-from benchmarks.machine import heading, machine
+from benchmarks.figures import Findings, Parser, hand_over
 from benchmarks.measured import Cost, measured, python
-from benchmarks.reconstruct_figures import against_peers, against_real, grown, of_real
+from benchmarks.reconstruct_figures import against_peers, grown
 from benchmarks.reconstruct_scores import Accuracy, score_ours, score_peer
 from benchmarks.reconstruct_surveys import pictures_of, render, subset, survey_toml
 
-PARTS = ("peers", "growth", "hierarchical", "haltbrekken", "brighton")
+PARTS = ("peers", "growth", "hierarchical")
 NO_PYORTHOMOSAIC = "pyorthomosaic: not installed; give --pyorthomosaic PYTHON"
 _GROWN, _GROWN_QUICK = (50, 100, 200, 400), (12, 24)
 _PEERS = Path(__file__).with_name("reconstruct_peers.py")
@@ -190,122 +182,6 @@ def run_hierarchical(work: Path, count: int, rendered: int, limit_s: float) -> F
     return against_peers(count, costs, found, rivals)
 
 
-def run_haltbrekken(work: Path, data: Path, interpreter: str | None, limit_s: float) -> Findings:
-    """Real stereo pictures without navigation: both mosaics in one picture."""
-    source, workspace = data / "haltbrekken", _emptied(work / "haltbrekken")
-    arguments = ["--left", str(source / "left"), "--right", str(source / "right")]
-    imported(arguments, workspace)
-    costs = ours(workspace)
-    print(f"\nhaltbrekken, 40 pictures\n{row('ours', list(costs.values()), None)}"
-          f"  {registered(workspace)}", flush=True)  # fmt: skip
-    findings = of_real("haltbrekken", workspace, costs)
-    if interpreter is None:
-        print(NO_PYORTHOMOSAIC)
-        return findings + Findings(left_out=(NO_PYORTHOMOSAIC,))
-    pictures = pictures_of(workspace, _emptied(work / "haltbrekken_pictures"))
-    out = _emptied(work / "haltbrekken_pyorthomosaic")
-    cost = peer("pyorthomosaic", interpreter, pictures, out, limit_s)
-    print(f"{row('pyorthomosaic', [cost], None)}  {peer_registered(out, cost)}")
-    if cost.ok and costs.get("mosaic") is not None and costs["mosaic"].ok:
-        target = work / "haltbrekken_mosaics.png"
-        side_by_side([workspace / "mosaic" / "mosaic.png", out / "orthophoto.tif"], target)
-        print(f"both mosaics: {target}")
-    return findings + against_real("haltbrekken", costs, "pyorthomosaic", cost)
-
-
-def run_brighton(work: Path, data: Path, interpreter: str | None, limit_s: float) -> Findings:
-    """Real drone pictures: distance from another tool's cloud."""
-    from reconstruct.evaluate.reference import evaluate_reference, first_placement, read_reference
-    from reconstruct.evaluate.registration import ReferenceSurface, distances, register_cloud
-    from reconstruct.views.model import read_frame
-
-    source, workspace = data / "brighton_beach", _emptied(work / "brighton_beach")
-    imported([str(source / "images")], workspace)
-    costs = ours(workspace)
-    print(f"\nbrighton_beach, 18 pictures\n{row('ours', list(costs.values()), None)}"
-          f"  {registered(workspace)}", flush=True)  # fmt: skip
-    findings = of_real("brighton", workspace, costs)
-    if findings.failed:
-        return findings
-    text, compared = evaluate_reference(workspace, source / "model.laz")
-    print(text)
-    findings += _distance("brighton", compared["survey_to_reference"]["median_m"])
-    if interpreter is None:
-        print(NO_PYORTHOMOSAIC)
-        return findings + Findings(left_out=(NO_PYORTHOMOSAIC,))
-    out = _emptied(work / "brighton_pyorthomosaic")
-    cost = peer("pyorthomosaic", interpreter, source / "images", out, limit_s)
-    print(f"{row('pyorthomosaic', [cost], None)}  {peer_registered(out, cost)}")
-    findings += against_real("brighton", costs, "pyorthomosaic", cost)
-    if not cost.ok:
-        return findings
-    datum = read_frame(workspace / "sparse" / "frame.json").datum
-    surface = ReferenceSurface.of(read_reference(source / "model.laz", datum)[0])
-    theirs, placed = read_reference(out / "dsm.tif", datum)
-    rng = np.random.default_rng(1)
-    fit = register_cloud(
-        theirs, surface, first_placement(theirs, surface), free_scale=True, rng=rng
-    )
-    away = distances(fit.reference_from_cloud.apply(theirs), surface, rng)
-    median_m = float(np.median(np.abs(away.signed_m)))
-    print(f"its elevation model to the reference: median {median_m:.4f} m, "
-          f"scale {fit.reference_from_cloud.scale:.5f}, georeferenced: {placed}")  # fmt: skip
-    own_m = compared["survey_to_reference"]["median_m"]
-    return findings + _distance("brighton", own_m, "pyorthomosaic", median_m)
-
-
-def _distance(
-    where: str, own_m: float, peer: str | None = None, peer_m: float | None = None
-) -> Findings:
-    name = f"{where}: median distance from another tool's cloud"
-    figure = Figure(name=name, value=own_m, unit="m", peer=peer, peer_value=peer_m)
-    return Findings(figures=(figure,))
-
-
-def imported(arguments: Sequence[str], workspace: Path) -> None:
-    """Bring real pictures in."""
-    subprocess.run(
-        python("-m", "alice_survey", "import-images", *arguments, "-w", str(workspace)),
-        check=True,
-        stdout=subprocess.DEVNULL,
-    )
-
-
-def registered(workspace: Path) -> str:
-    """How many pictures our model holds."""
-    file = workspace / "sparse" / "registration.json"
-    if not file.exists():
-        return ""
-    found = json.loads(file.read_text())
-    return (
-        f"{found['registered']} of {found['total']} registered, "
-        f"{found['mean_reprojection_px']:.3f} px"
-    )
-
-
-def peer_registered(out: Path, cost: Cost) -> str:
-    """How many pictures a peer's model holds."""
-    if not cost.ok:
-        return ""
-    return f"{len(json.loads((out / 'cameras.json').read_text())['centres'])} registered"
-
-
-def side_by_side(files: Sequence[Path], target: Path, height_px: int = 1400) -> None:
-    """Pictures of one height next to each other, transparent parts white."""
-    columns = []
-    for file in files:
-        picture = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-        if picture.shape[2] == 4:
-            opaque = picture[..., 3:] > 0
-            picture = np.where(opaque, picture[..., :3], 255).astype(np.uint8)
-            rows, cols = (np.flatnonzero(opaque[..., 0].any(axis=a)) for a in (1, 0))
-            picture = picture[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1]
-        scale = height_px / picture.shape[0]
-        columns += [cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)]
-        columns += [np.full((columns[-1].shape[0], 24, 3), 255, np.uint8)]
-    cv2.imwrite(str(target), np.hstack(columns[:-1]))
-
-
 def _emptied(folder: Path) -> Path:
     """A folder that is not there any more."""
     import shutil
@@ -326,9 +202,7 @@ def find_pyorthomosaic(given: str | None) -> str | None:
 
 def main() -> int:
     """Run the parts that are requested."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
-    parser.add_argument("--work", type=Path, required=True, help="scratch folder")
-    parser.add_argument("--data", type=Path, default=Path("../shared/data"), help="real pictures")
+    parser = Parser(__doc__, quick="small surveys, to see that it runs", work="scratch folder")
     parser.add_argument("--demo", type=Path, help="workspace with rendered demo pictures")
     parser.add_argument("--pyorthomosaic", help="a Python that has pyOrthomosaic")
     parser.add_argument("--only", default=",".join(PARTS), help="parts, by commas")
@@ -338,15 +212,12 @@ def main() -> int:
     parser.add_argument("--pictures", default="50,100", help="of `peers`, by commas")
     parser.add_argument("--large", type=int, default=_GROWN[-1], help="of `hierarchical`")
     parser.add_argument("--sparse", action="store_true", help="end `peers` at the sparse model")
-    add_options(parser, quick="small surveys, to see that it runs")
-    given = parser.parse_args()
+    given, about = parser.begin("pycolmap", "opencv-contrib-python-headless", "numpy")
     parts = given.only.split(",")
     if unknown := set(parts) - set(PARTS):
         raise SystemExit(f"no part {min(unknown)!r}; there are {', '.join(PARTS)}")
-    about, findings = machine(["pycolmap", "opencv-contrib-python-headless", "numpy"]), Findings()
-    print(heading(about))
+    findings = Findings()
     interpreter = find_pyorthomosaic(given.pyorthomosaic)
-    given.work.mkdir(parents=True, exist_ok=True)
     work = given.work.resolve()
     if "peers" in parts:
         demo = given.demo
@@ -362,12 +233,6 @@ def main() -> int:
         maximum = (_GROWN_QUICK if given.quick else _GROWN)[-1]
         large = maximum if given.quick else given.large
         findings += run_hierarchical(work, large, max(large, maximum), given.limit)
-    for name, function in (("haltbrekken", run_haltbrekken), ("brighton", run_brighton)):
-        if name in parts:
-            if (given.data / ("brighton_beach" if name == "brighton" else name)).is_dir():
-                findings += function(work, given.data.resolve(), interpreter, given.limit)
-            else:
-                findings += Findings(left_out=(f"{name}: no pictures in {given.data}",))
     return hand_over(given, about, findings)
 
 

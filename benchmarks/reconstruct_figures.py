@@ -1,9 +1,7 @@
 """The figures of `benchmarks.reconstruct`: ours and those of other programs, or ours alone."""
 
-import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
 
 from benchmarks.figures import Figure, Findings
 from benchmarks.measured import Cost
@@ -57,28 +55,6 @@ def grown(count: int, costs: Mapping[str, Cost], found: Accuracy | None) -> Find
         numbers["registered"] = (found.registered, "pictures")
     where = f"{count} pictures"
     return Findings(figures=tuple(_figures(where, numbers)), failed=failures(where, costs))
-
-
-def of_real(where: str, workspace: Path, costs: Mapping[str, Cost]) -> Findings:
-    """Cost of ours on real pictures, and what was registered."""
-    numbers = _spent(list(costs.values()))
-    file = workspace / "sparse" / "registration.json"
-    if file.exists():
-        found = json.loads(file.read_text())
-        numbers[f"registered of {found['total']}"] = (found["registered"], "pictures")
-        numbers["mean reprojection error"] = (found["mean_reprojection_px"], "px")
-    failed = failures(where, costs)
-    return Findings(figures=() if failed else tuple(_figures(where, numbers)), failed=failed)
-
-
-def against_real(where: str, costs: Mapping[str, Cost], name: str, cost: Cost) -> Findings:
-    """Cost of ours next to another program's on real pictures."""
-    if not cost.ok:
-        return Findings(left_out=(f"{where}, {name}: {cost.last_line()}",))
-    if failures(where, costs):
-        return Findings()
-    own, theirs = _spent(list(costs.values())), _spent([cost])
-    return Findings(figures=tuple(_figures(where, own, name, theirs)))
 
 
 def failures(where: str, costs: Mapping[str, Cost]) -> tuple[str, ...]:

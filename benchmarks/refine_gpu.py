@@ -10,7 +10,6 @@ its cores. As many processes as there are cores then refine views at the same ti
 the dense stage.
 """
 
-import argparse
 import os
 import pickle
 import statistics
@@ -29,8 +28,7 @@ import cv2
 import numpy as np
 
 from alice_survey.app.commands.base import is_gpu_chosen
-from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
-from benchmarks.machine import heading, machine
+from benchmarks.figures import Figure, Findings, Goal, Parser, hand_over
 from reconstruct.dense.refine_depth import ComparedView, Float32, RefinedDepth, prepare, refine
 from reconstruct.views.model import View, scaled_view
 from tests.oracles_dense import Scene, hits, port_view, speckle
@@ -197,12 +195,9 @@ def _cores() -> int:
 
 def main() -> int:
     """Measure, print and hand over."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = Parser(__doc__, quick="one run of the smallest pictures")
     parser.add_argument("--megapixels", type=float, nargs="+", default=[0.6, 2.3])
-    add_options(parser, quick="one run of the smallest pictures")
-    options = parser.parse_args()
-    about = machine(["numpy", "numba"])
-    print(heading(about))
+    options, about = parser.begin("numpy", "numba")
     if not is_gpu_chosen("auto"):
         return hand_over(options, about, Findings(left_out=("no GPU that can be used",)))
     sizes = [min(options.megapixels)] if options.quick else options.megapixels

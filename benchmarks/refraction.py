@@ -9,7 +9,6 @@ OPENCV model of the pixels as taken, and, where requested, an exact refractive a
 as can be (10 minutes a row with 48 stations and 1000 points).
 """
 
-import argparse
 import sys
 import time
 from collections.abc import Sequence
@@ -21,8 +20,7 @@ import numpy as np
 import pycolmap
 
 from alice_survey.core.frames import Array
-from benchmarks.figures import Figure, Findings, add_options, hand_over
-from benchmarks.machine import heading, machine
+from benchmarks.figures import Figure, Findings, Parser, hand_over
 from reconstruct.mapping.bundle import all_pictures, held_options
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.refraction import adjust_freely, refract
@@ -37,14 +35,12 @@ _QUICK_STATIONS, _QUICK_POINTS = 12, 800
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = Parser(__doc__, quick=f"{_QUICK_STATIONS} stations and {_QUICK_POINTS} points")
     parser.add_argument("--stations", type=int, default=48)
     parser.add_argument("--points", type=int, default=6000)
-    add_options(parser, quick=f"{_QUICK_STATIONS} stations and {_QUICK_POINTS} points")
-    asked = parser.parse_args()
+    asked, about = parser.begin("numpy", "scipy", "pycolmap")
     stations = _QUICK_STATIONS if asked.quick else asked.stations
-    about, figures = machine(("numpy", "scipy", "pycolmap")), list[Figure]()
-    print(f"{heading(about)}\n", flush=True)
+    figures = list[Figure]()
     for port_m in (0.02, 0.05):
         for tilt_deg in (0.0, 2.0):
             lines = 4

@@ -11,7 +11,6 @@ pictures, then the exponent of growth between the two largest surveys, and what 
 100,000 pictures.
 """
 
-import argparse
 import json
 import os
 import subprocess
@@ -22,8 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
-from benchmarks.machine import heading, machine
+from benchmarks.figures import Figure, Findings, Goal, Parser, hand_over
 from benchmarks.scale_steps import MAKE, MAPPED, MAPPED_POINTS, PLACING, STEPS, UNMATCHED
 
 _MANY = 100_000
@@ -97,12 +95,22 @@ def figures_of(rows: Sequence[StepCost], *, judged: bool) -> list[Figure]:
 
 def main() -> None:
     """Print the table."""
-    options = _options()
-    about = machine(("numpy", "scipy"))
-    print(
-        f"{heading(about)}\n\n{'step':<14}{'pictures':>9}{'of':>12}{'s':>10}{'GiB':>7}", flush=True
+    parser = Parser(
+        __doc__, quick="200 and 400 pictures of the demo's rig", work="keeps surveys and results"
     )
-    options.work.mkdir(parents=True, exist_ok=True)
+    parser.add_argument("--pictures", type=int, nargs="+", default=[1000, 5000, 10000], metavar="N")
+    parser.add_argument("--only", nargs="+", default=[], choices=STEPS, metavar="STEP")
+    parser.add_argument("--threads", type=int, default=1, help="workers")
+    parser.add_argument(
+        "--points", type=int, default=MAPPED_POINTS, help="of a station in `map` and `placing`"
+    )
+    parser.add_argument(
+        "--unmatched", type=int, default=UNMATCHED, help="keypoints of a picture in `placing`"
+    )
+    options, about = parser.begin("numpy", "scipy")
+    if options.quick:
+        options.pictures = [200, 400]
+    print(f"{'step':<14}{'pictures':>9}{'of':>12}{'s':>10}{'GiB':>7}", flush=True)
     rows: dict[str, list[StepCost]] = {}
     failed = []
     more = ("--points", str(options.points), "--unmatched", str(options.unmatched))
@@ -127,25 +135,6 @@ def main() -> None:
     findings = Findings(figures=tuple(figures), failed=tuple(failed))
     kept = {step: [asdict(row) for row in row_of] for step, row_of in rows.items()}
     sys.exit(hand_over(options, about, findings, {"steps": kept}))
-
-
-def _options() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--work", type=Path, required=True, help="keeps surveys and results")
-    parser.add_argument("--pictures", type=int, nargs="+", default=[1000, 5000, 10000], metavar="N")
-    parser.add_argument("--only", nargs="+", default=[], choices=STEPS, metavar="STEP")
-    parser.add_argument("--threads", type=int, default=1, help="workers")
-    parser.add_argument(
-        "--points", type=int, default=MAPPED_POINTS, help="of a station in `map` and `placing`"
-    )
-    parser.add_argument(
-        "--unmatched", type=int, default=UNMATCHED, help="keypoints of a picture in `placing`"
-    )
-    add_options(parser, quick="200 and 400 pictures of the demo's rig")
-    options = parser.parse_args()
-    if options.quick:
-        options.pictures = [200, 400]
-    return options
 
 
 if __name__ == "__main__":

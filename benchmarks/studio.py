@@ -12,7 +12,6 @@ put under load. Ends with exit code 1 when
 a goal is missed.
 """
 
-import argparse
 import math
 import select
 import socket
@@ -37,8 +36,7 @@ from alice_survey.app.studio.files import Workspace
 from alice_survey.app.studio.layers import Layers
 from alice_survey.core.errors import collected_by
 from alice_survey.core.executor import SERIAL
-from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
-from benchmarks.machine import heading, machine
+from benchmarks.figures import Figure, Findings, Goal, Parser, hand_over
 from missions.plan.preview import draft_settings, preview
 from missions.plan.run import run_plan
 
@@ -109,11 +107,8 @@ def _twin(path: Path, halvings: int, x: int, y: int, tile_px: int) -> bytes:
 
 def main() -> None:
     """Measure, print, and say which goals are missed."""
-    parser = argparse.ArgumentParser(description="Benchmark of the studio.")
-    add_options(parser, quick="a strip of 1,000 swaths, and a tenth of the load")
-    options = parser.parse_args()
-    about = machine(("numpy", "numba", "shapely", "tomlkit", "rasterio"))
-    print(heading(about), "\n", flush=True)
+    parser = Parser(__doc__, quick="a strip of 1,000 swaths, and a tenth of the load")
+    options, about = parser.begin("numpy", "numba", "shapely", "tomlkit", "rasterio")
     swaths = 1_000 if options.quick else 10_000
     figures = [
         *replan_figures("tutorial", {}, 2.5),

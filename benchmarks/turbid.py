@@ -23,8 +23,7 @@ from alice_survey.app.stages import spec
 from alice_survey.core.config import Jerlov
 from alice_survey.core.errors import AliceError
 from alice_survey.core.executor import local_executor
-from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
-from benchmarks.machine import heading, machine
+from benchmarks.figures import Figure, Findings, Goal, Parser, hand_over
 from benchmarks.measured import measured
 from benchmarks.reconstruct_surveys import demo_like, render
 from reconstruct.evaluate.figures import rms
@@ -59,15 +58,11 @@ LEVELS = (
 
 def main() -> int:
     """Render what is missing, map, compare; the exit code is 1 when a goal is missed."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--work", type=Path, required=True, help="keeps pictures and workspaces")
+    parser = Parser(__doc__, quick="the third level alone", work="keeps pictures and workspaces")
     parser.add_argument("--map", type=Path, help=argparse.SUPPRESS)
-    add_options(parser, quick="the third level alone")
-    options = parser.parse_args()
+    options, about = parser.begin("numpy", "opencv-contrib-python-headless", "pycolmap")
     if options.map is not None:
         return _map(options.map)
-    about = machine(("numpy", "opencv-contrib-python-headless", "pycolmap"))
-    print(f"{heading(about)}\n", flush=True)
     findings = Findings()
     for level in LEVELS[2:3] if options.quick else LEVELS:
         rendered = options.work / level.name / "rendered"

@@ -9,7 +9,6 @@ recorded. One core; the best run of several counts. `seas`: see `vehicle_seas`.
 Ends with exit code 1 when a goal is missed.
 """
 
-import argparse
 import math
 import sys
 import time
@@ -23,8 +22,7 @@ from alice_survey.sim.vehicle.pilot.memory import DONE, NONE, PHASE, REASON
 from alice_survey.sim.vehicle.sea import FloorGrid, level_floor
 from alice_survey.sim.vehicle.simulator import Setup, simulate
 from benchmarks import vehicle_seas
-from benchmarks.figures import Figure, Findings, Goal, add_options, hand_over
-from benchmarks.machine import heading, machine
+from benchmarks.figures import Figure, Findings, Goal, Parser, hand_over
 from camera_calib.rig import design_rig
 from missions.fly.simulation import flight_settings, mission_setup
 from missions.plan.planner import plan_survey
@@ -35,12 +33,10 @@ _PARTS = ("loop", "seas")
 
 def main() -> int:
     """Measure, print, and say which goals are missed."""
-    parser = argparse.ArgumentParser(description="Benchmarks of the vehicle.")
-    add_options(parser, quick="fewer and shorter runs")
+    parser = Parser(__doc__, quick="fewer and shorter runs")
     parser.add_argument("--only", nargs="+", choices=_PARTS, default=list(_PARTS))
-    options = parser.parse_args()
-    about, report, findings = machine(("numpy", "numba", "scipy")), dict[str, Any](), Findings()
-    print(heading(about), "\n", flush=True)
+    options, about = parser.begin("numpy", "numba", "scipy")
+    report, findings = dict[str, Any](), Findings()
     if "loop" in options.only:
         flights = measure(1 if options.quick else 5)
         report["loop"] = [{**asdict(row), "factor": row.factor} for row in flights]

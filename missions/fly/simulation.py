@@ -81,7 +81,7 @@ from alice_survey.sim.vehicle.simulator import TICK_S, Flown, Setup, simulate
 from alice_survey.sim.vehicle.vehicle import Vehicle
 from camera_calib.rig import Rig
 from missions.coverage.certificate import certificate
-from missions.coverage.stations import Stations, plan_pattern, stations_of_lines
+from missions.coverage.stations import MAX_ALTITUDES, Stations, plan_pattern, stations_of_plan
 from missions.exports.follower import cola2_delta_m, cola2_settings, sways
 from missions.exports.geometry import CameraMount
 from missions.exports.registry import read_mission
@@ -773,7 +773,7 @@ def mission_summary(known: MissionOfPlan, flight: Flight, rig: Rig) -> dict[str,
         rig: the cameras in the survey's water.
     """
     plan = known.plan
-    promised = stations_of_lines(_flown_lines(plan), plan.altitude_m)
+    promised = planned_stations(plan)
     beyond_m = overshoot_m(known, flight)
     return {
         "file": known.path.name,
@@ -788,8 +788,12 @@ def mission_summary(known: MissionOfPlan, flight: Flight, rig: Rig) -> dict[str,
 
 
 def covered_shares(plan: Plan, rig: Rig, stations: Stations) -> dict[str, float]:
-    """What the pictures of some stations see of the whole area; `plan check` shows more."""
-    seen = certificate(plan.area, rig, stations, plan_pattern(plan, rig))
+    """What the pictures of some stations see of the whole area; `plan check` shows more.
+
+    Those from too high do not count, as in the plan's certificate.
+    """
+    near = stations.some(stations.altitude_m <= MAX_ALTITUDES * plan.altitude_m)
+    seen = certificate(plan.area, rig, near, plan_pattern(plan, rig))
     names = ("covered_share", "every_camera_share", "share_at_overlap")
     return {name: getattr(seen, name) for name in names}
 
@@ -828,6 +832,15 @@ def one_dive(plan: Plan, dive: int | None) -> Plan:
 def stations_of_dives(plan: Plan) -> int:
     """How many times all cameras take a picture on the plan's dives."""
     return sum(line.stations for line in _flown_lines(plan))
+
+
+def planned_stations(plan: Plan) -> Stations:
+    """The stations of the plan's dives, flown exactly."""
+    floors_m = np.concatenate(plan.line_floors_m) if plan.line_floors_m else None
+    stations = stations_of_plan(plan, floors_m)
+    first, last = np.transpose([(dive.first_line, dive.last_line) for dive in plan.dives])
+    line = stations.line[:, None]
+    return stations.some(np.any((first <= line) & (line <= last), axis=1))
 
 
 def _flown_lines(plan: Plan) -> list[Line]:

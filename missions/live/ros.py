@@ -256,7 +256,7 @@ def pilot_over_ros(mission: LiveMission, topics: Topics, *, sim_time: bool) -> N
         VehicleError: ROS 2 is not installed, a topic cannot have its name, or `/clock` stood still.
     """
     with _session() as ros:
-        node = _PilotNode(ros, mission, topics, sim_time)
+        node = PilotNode(ros, mission, topics, sim_time)
         try:
             while mission.loop.state != LinkState.OVER:
                 ros.rclpy.spin_once(node.node, timeout_sec=_WAIT_S)
@@ -271,7 +271,9 @@ def pilot_over_ros(mission: LiveMission, topics: Topics, *, sim_time: bool) -> N
             node.node.destroy_node()
 
 
-class _PilotNode:
+class PilotNode:
+    """The pilot and its topics."""
+
     def __init__(
         self, ros: RosLibrary, mission: LiveMission, topics: Topics, sim_time: bool
     ) -> None:

@@ -25,11 +25,13 @@ from missions.exports.format import options_of
 from missions.exports.write import write_exports
 from missions.fly.simulation import (
     PASSED_M,
+    covered_shares,
     flight_settings,
     mission_of_settings,
     mission_summary,
     overshoot_m,
     picture_times,
+    planned_stations,
     simulate_mission,
 )
 from missions.route.energy import planned_vehicle
@@ -73,6 +75,19 @@ def exported(plan: Plan, config: SurveyConfig, name: str, folder: Path) -> Surve
     options = options_of(config.camera, config.plan, config.vehicle, config.sea)
     write_exports(folder, plan, rig_of(config), formats=[name], options=options)
     return change_section(config, "vehicle", mission_file=folder / FILES[name])
+
+
+@pytest.mark.parametrize(("altitudes", "least", "most"), [(1.4, 0.9, 1.0), (1.6, 0.0, 0.0)])
+def test_pictures_from_too_high_are_no_coverage(
+    altitudes: float, least: float, most: float
+) -> None:
+    """As in the plan's certificate: neither where a flight took them nor where a plan lays them."""
+    plan, rig = small_plan(), rig_of(calm())
+    depths = tuple((6.0 - altitudes * plan.altitude_m,) * line.stations for line in plan.lines)
+    floors = tuple((6.0,) * line.stations for line in plan.lines)
+    stations = planned_stations(replace(plan, line_depths_m=depths, line_floors_m=floors))
+    assert len(stations.line) == plan.stations
+    assert least <= covered_shares(plan, rig, stations)["covered_share"] <= most
 
 
 def fly(plan: Plan, config: SurveyConfig) -> Flight:

@@ -123,17 +123,22 @@ def fly(port: int, settings: Path, track: Path) -> None:
     write_csv(track, columns, rows)
 
 
+def altimeter_m(vehicle: SimulatedVehicle) -> float:
+    """Range straight down from the DVL's place to the sea floor; 0 is no echo."""
+    truth = vehicle.world.now
+    turn = Rotation.from_quat(truth[3:7])
+    place = truth[:3] + turn.apply(vehicle.parts.sensors.place[DVL])
+    reach = floor_range(vehicle.parts.floor, *place, *turn.apply([0.0, 0.0, 1.0]), 75.0)
+    return reach if math.isfinite(reach) else 0.0
+
+
 def send(link: object, vehicle: SimulatedVehicle, stamp_ms: int, shift: Array) -> None:
     mav, truth = link.mav, vehicle.world.now  # type: ignore[attr-defined]
     turn = Rotation.from_quat(truth[3:7])
     roll, pitch, heading = attitude_from_rotation(turn)
     mav.heartbeat_send(SUBMARINE, ARDUPILOT, 1 | ARMED, GUIDED, 4)
     mav.attitude_send(stamp_ms, roll, pitch, heading, *truth[10:13])
-    place = vehicle.parts.sensors.place[DVL]
-    north, east, depth = truth[:3] + turn.apply(place)
-    x, y, z = turn.apply([0.0, 0.0, 1.0])
-    reach = floor_range(vehicle.parts.floor, north, east, depth, x, y, z, 75.0)
-    mav.rangefinder_send(reach if math.isfinite(reach) else 0.0, 0.0)
+    mav.rangefinder_send(altimeter_m(vehicle), 0.0)
     mav.local_position_ned_send(stamp_ms, *(truth[:3] - shift), *truth[7:10])
 
 
