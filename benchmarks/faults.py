@@ -49,7 +49,7 @@ from missions.fly.simulation import (
     whole_route,
 )
 from missions.live import ros
-from missions.live.mission import RECORD_COLUMNS, LinkLimits, Odometry, mission_of
+from missions.live.mission import RECORD_COLUMNS, LinkLimits, LinkState, Odometry, mission_of
 from missions.logs.ros_builder import MAP
 from missions.plan.planner import plan_survey
 from missions.stages import FLY
@@ -168,7 +168,7 @@ def _live(case: Case, config: SurveyConfig, plan: Plan) -> Result:
     max_s = max_mission_s(plan) + 2.0 * max_ascent_s(plan)
     setup = mission_setup(plan, settings, true_floor(plan, settings), max_s, rng)
     vehicle, door_of = SimulatedVehicle(setup, rng), Nodes if case.door == "ROS 2" else Submarine
-    door = door_of(mission, vehicle, Link(case).pass_on, case.seed)
+    door = door_of(mission, vehicle, Link(case).pass_on)
     truth, energy_j, power_w = list[Array](), 0.0, np.zeros(len(mission.thrusters))
     while vehicle.tick * TICK_S < max_s:
         vehicle.sense()
@@ -177,22 +177,22 @@ def _live(case: Case, config: SurveyConfig, plan: Plan) -> Result:
         propulsion = vehicle.parts.plant.propulsion
         electrical_power(propulsion, state[STATE:], state[7:STATE], power_w)
         energy_j += float(power_w.sum()) * TICK_S
-        if door.is_over or vehicle.touches_floor:
+        is_over = door.is_safe and mission.loop.state == LinkState.OVER
+        if is_over or vehicle.touches_floor:
             break
         vehicle.move(speeds)
-    poses, time_s = np.array(truth), TICK_S * np.arange(len(truth))
+    poses, time_s = np.array(truth), TICK_S * np.arange(len(truth), dtype=np.float64)
     arm = np.array(config.camera.position_body_m)
-    glass_ned = poses[:, :3] + Rotation.from_quat(poses[:, 3:]).apply(arm)
+    glass_ned: Array = poses[:, :3] + Rotation.from_quat(poses[:, 3:]).apply(arm)
     columns = [RECORD_COLUMNS.index(n) for n in ("time_s", "line", "glass_north_m", "glass_east_m")]
     rows = np.array([[float(row[i]) for i in columns] for row in mission.rows])
     rows = rows[np.isfinite(rows[:, 2])]
     taken = trigger_times(plan, rows[:, 0] - ros.START_S, rows[:, 1], rows[:, 2:])
-    touched = "the hull touched the sea floor" if vehicle.touches_floor else ""
-    text, data = mission.summary()
-    return _result(
-        case, plan, touched or data["ending"] or text, 0 if PilotCommand().is_passed(data) else 3,
-        energy_j, time_s, glass_ned, taken, is_bounded=door.is_over,
-    )  # fmt: skip
+    touched = vehicle.touches_floor
+    ending = "the hull touched the sea floor" if touched else mission.loop.ending
+    code = 0 if PilotCommand().is_passed(mission.summary()[1]) else 3
+    end: dict[str, Any] = {"taken": taken, "is_bounded": is_over or touched}
+    return _result(case, plan, ending, code, energy_j, time_s, glass_ned, **end)
 
 
 def _result(

@@ -399,8 +399,6 @@ def main() -> None:
     options, about = parser.begin("numpy", "scipy", "opencv-contrib-python-headless", "rasterio")
     if options.quick:
         options.pictures = [80]
-    print(f"{'stage':<8}{'pictures':>9}{'s':>9}{'wall s':>9}{'parent':>8}"
-          f"{'worker':>8}{'disk GiB':>10}{'files':>9}{'open':>6}", flush=True)  # fmt: skip
     tile = make_tile(options.work)
     own = len(read_manifest(tile / "images" / "manifest.csv"))
     rows: dict[str, list[StageCost]] = {}
@@ -417,9 +415,6 @@ def main() -> None:
             failed.append(f"mapping of {wanted} pictures")
         for row in (*((mapped,) if mapped else ()), *costs_of(workspace, pictures)):
             rows.setdefault(row.stage, []).append(row)
-            print(f"{row.stage:<8}{row.pictures:>9}{row.cpu_s:>9.1f}{row.wall_s:>9.1f}"
-                  f"{row.parent_gib:>8.2f}{row.worker_gib:>8.2f}{row.disk_gib:>10.2f}"
-                  f"{row.files:>9}{row.open_files:>6}", flush=True)  # fmt: skip
         if made:
             figures += heights_of(lattice, workspace, pictures)
     for of_stage in rows.values():

@@ -69,28 +69,6 @@ def peer(
     return measured(command, out.with_suffix(".log"), limit_s)
 
 
-_HEAD = (
-    f"{'':34} {'wall s':>8} {'cpu s':>8} {'MiB':>7} {'reg.':>5} {'cameras':>8} {'bend':>7} "
-    f"{'points':>15} {'surface':>15}"
-)
-
-
-def row(name: str, costs: Sequence[Cost], found: Accuracy | None) -> str:
-    """One line of the table; the reason where it failed."""
-    wall, cpu = sum(c.wall_s for c in costs), sum(c.cpu_s for c in costs)
-    line = f"{name:34} {wall:8.1f} {cpu:8.1f} {max(c.peak_mib for c in costs):7.0f}"
-    failed = next((c for c in costs if not c.ok), None)
-    if failed is not None:
-        return f"{line}  failed: {failed.last_line()}"
-    if found is None:
-        return line
-    return (
-        f"{line} {found.registered:5} {found.cameras_mm:8.2f} {found.bend_mm:7.2f} "
-        f"{found.points_mm:8.2f}/{found.points_median_mm:6.2f} "
-        f"{found.surface_mm:8.2f}/{found.surface_median_mm:6.2f}"
-    )
-
-
 def run_peers(
     work: Path,
     demo: Path,
@@ -99,7 +77,7 @@ def run_peers(
     limit_s: float,
     ends: Sequence[str] = tuple(_STAGES),
 ) -> Findings:
-    """Table of all programs on the same rendered pictures; ours compiled beforehand."""
+    """All programs on the same rendered pictures; ours compiled beforehand."""
     findings, to_mosaic = Findings(), "mosaic" in ends
     ours(subset(demo, work / "compiled", 8), ends)
     for count in counts:
@@ -107,25 +85,18 @@ def run_peers(
         folder = work / f"peers{count}_pictures"
         _emptied(folder)
         pictures_of(part, folder)
-        print(f"\n{count} rendered pictures; errors in mm: rms of cameras; rms/median of points "
-              f"and of cells\n{_HEAD}", flush=True)  # fmt: skip
         costs = ours(part, ends)
         found = score_ours(part) if costs["sparse"].ok else None
-        print(row("ours, to the sparse model", [costs["sparse"]], found), flush=True)
-        if to_mosaic:
-            print(row("ours, to surface and mosaic", list(costs.values()), found), flush=True)
         rivals: dict[str, tuple[Cost | None, Accuracy | None]] = {}
         programs = (("colmap", sys.executable), ("pyorthomosaic", interpreter))
         for name, python_of in programs if to_mosaic else programs[:1]:
             if python_of is None:
-                print(NO_PYORTHOMOSAIC)
                 findings += Findings(left_out=(f"{count} pictures: {NO_PYORTHOMOSAIC}",))
                 rivals[name] = (None, None)
                 continue
             out = _emptied(work / f"peers{count}_{name}")
             cost = peer(name, python_of, folder, out, limit_s)
             accuracy = score_peer(out, part / "images" / "truth") if cost.ok else None
-            print(row(name, [cost], accuracy), flush=True)
             rivals[name] = (cost, accuracy)
         findings += against_peers(count, costs, found, rivals)
     return findings
@@ -136,21 +107,10 @@ def run_growth(work: Path, counts: Sequence[int], scale: int) -> Findings:
     findings = Findings()
     whole = work / f"growth_{max(counts)}"
     render(whole, survey_toml(max(counts), scale))
-    print(f"\ngrowth, at 1/{scale} of the resolution: seconds a picture (cpu), peak MiB\n"
-          f"{'pictures':>9} " + " ".join(f"{stage:>20}" for stage in _STAGES)
-          + f" {'registered':>11}")  # fmt: skip
     for count in counts:
         part = subset(whole, work / f"growth{count}", count)
         costs = ours(part)
-        cells = [
-            f"{c.wall_s / count:6.2f} ({c.cpu_s / count:5.2f}) {c.peak_mib:6.0f}"
-            if c.ok else f"failed: {c.last_line()}"
-            for c in costs.values()
-        ]  # fmt: skip
         found = score_ours(part) if costs["sparse"].ok else None
-        registered = "" if found is None else f"{found.registered:6} of {count}"
-        print(f"{count:9} " + " ".join(f"{cell:>20}" for cell in cells) + f" {registered}",
-              flush=True)  # fmt: skip
         findings += grown(count, costs, found)
     return findings
 
@@ -162,17 +122,14 @@ def run_hierarchical(work: Path, count: int, rendered: int, limit_s: float) -> F
     ours(subset(whole, work / "compiled", 8), ["sparse"])
     part = subset(whole, work / f"hierarchical{count}", count)
     pictures = pictures_of(part, _emptied(work / f"hierarchical{count}_pictures"))
-    print(f"\n{count} rendered pictures, errors in mm\n{_HEAD}", flush=True)
     costs = ours(part, ["sparse"])
     found = score_ours(part) if costs["sparse"].ok else None
-    print(row("ours, to the sparse model", [costs["sparse"]], found), flush=True)
     rivals: dict[str, tuple[Cost | None, Accuracy | None]] = {}
     for name in ("hierarchical", "global"):
         out = _emptied(work / f"hierarchical{count}_{name}")
         manifest = part / "images" / "manifest.csv"
         cost = peer(name, sys.executable, pictures, out, limit_s, manifest)
         accuracy = score_peer(out, part / "images" / "truth") if cost.ok else None
-        print(row(f"colmap, {name}", [cost], accuracy), flush=True)
         if cost.ok:
             facts = json.loads((out / "cameras.json").read_text())
             spent = ", ".join(f"{step} {s:.0f} s" for step, s in facts["cpu_s"].items())

@@ -110,7 +110,6 @@ def main() -> None:
     options, about = parser.begin("numpy", "scipy")
     if options.quick:
         options.pictures = [200, 400]
-    print(f"{'step':<14}{'pictures':>9}{'of':>12}{'s':>10}{'GiB':>7}", flush=True)
     rows: dict[str, list[StepCost]] = {}
     failed = []
     more = ("--points", str(options.points), "--unmatched", str(options.unmatched))
@@ -124,8 +123,6 @@ def main() -> None:
                 failed.append(f"{step} of {pictures} pictures")
                 continue
             rows.setdefault(step, []).append(spent)
-            print(f"{step:<14}{pictures:>9}{spent.amount:>12}{spent.cpu_s:>10.2f}"
-                  f"{spent.peak_gib:>7.2f}", flush=True)  # fmt: skip
     figures = [
         figure
         for step, row in rows.items()

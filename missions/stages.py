@@ -142,7 +142,7 @@ FLY = StageSpec(
     folder="flight",
     command="fly",
     about="the plan flown by a simulated vehicle",
-    version=7,
+    version=8,
     work="missions.fly.run:run_fly",
     takes=(
         "seed",

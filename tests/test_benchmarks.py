@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks import table
+from benchmarks import faults, missions, table
 from benchmarks.figures import Figure, Findings, Goal, hand_over
 from benchmarks.measured import Cost
 from benchmarks.parts import PARTS
@@ -187,3 +187,21 @@ def test_sags_are_those_of_a_bent_and_tilted_block_whichever_way_it_lies() -> No
     np.testing.assert_allclose(
         sag_weights(places[:, :2]) @ heights.ravel(), (0.012, -0.003), atol=1e-12
     )
+
+
+@pytest.mark.slow
+def test_dives_with_faults_end_in_time_and_with_the_exit_code_that_they_deserve() -> None:
+    """One dive in five of the benchmark: two of each loop, and four through `fly`."""
+    pytest.importorskip("rclpy", reason="ROS 2 is not installed: pip install '.[ros]'")
+    results = [faults.dive(case) for case in faults.cases()[::5]]
+    assert all(result.is_right for result in results), results
+    assert {result.exit_code for result in results} == {0, 3}
+    assert {result.case.door for result in results} == {"fly", "ROS 2", "MAVLink"}
+
+
+@pytest.mark.slow
+def test_exported_missions_keep_clear_of_terrain() -> None:
+    rows = missions.over_terrain(quick=True)
+    assert len(rows) == 12
+    for row in rows:
+        assert row.ending.startswith("refused") or 0.5 < row.clearance_m < 2.5, row

@@ -95,7 +95,6 @@ from missions.route.energy import (
 from missions.route.terrain import envelope, with_depths_between
 from missions.values.flight import Flight, trigger_times
 from missions.values.legs import Leg, Route
-from missions.values.line import Line
 from missions.values.mission import Mission
 from missions.values.navigation import BelievedNavigation
 from missions.values.plan_file import Plan
@@ -831,7 +830,7 @@ def one_dive(plan: Plan, dive: int | None) -> Plan:
 
 def stations_of_dives(plan: Plan) -> int:
     """How many times all cameras take a picture on the plan's dives."""
-    return sum(line.stations for line in _flown_lines(plan))
+    return len(planned_stations(plan))
 
 
 def planned_stations(plan: Plan) -> Stations:
@@ -841,12 +840,6 @@ def planned_stations(plan: Plan) -> Stations:
     first, last = np.transpose([(dive.first_line, dive.last_line) for dive in plan.dives])
     line = stations.line[:, None]
     return stations.some(np.any((first <= line) & (line <= last), axis=1))
-
-
-def _flown_lines(plan: Plan) -> list[Line]:
-    return [
-        line for dive in plan.dives for line in plan.lines[dive.first_line : dive.last_line + 1]
-    ]
 
 
 def whole_route(plan: Plan) -> Route:

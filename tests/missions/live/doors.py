@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,8 +16,9 @@ from alice_survey.sim.vehicle import estimate_vector as vector
 from alice_survey.sim.vehicle.simulator import TICK_S, SimulatedVehicle
 from missions.live import ros
 from missions.live.mavlink_pilot import GUIDED, SURFACE, MavlinkPilot
-from missions.live.mission import LinkState, LiveMission, Odometry
-from tests.missions.live.fake_ardusub import InnerLoops, altimeter_m
+from missions.live.mission import LiveMission, Odometry
+from tests.missions.live.fake_ardusub import InnerLoops
+from tests.missions.live.flights import altimeter_m
 
 PassOn = Callable[[Odometry], tuple[Odometry, str]]
 """What arrives of odometry that is sent, and the name of its frame."""
@@ -26,24 +28,23 @@ SET_MODE, NO_YAW = 176, 1024
 class Nodes:
     """The two nodes of ROS 2, pilot and vehicle, joined by this object instead of DDS."""
 
-    def __init__(
-        self, mission: LiveMission, vehicle: SimulatedVehicle, pass_on: PassOn, seed: int
-    ) -> None:
+    is_safe = True
+
+    def __init__(self, mission: LiveMission, vehicle: SimulatedVehicle, pass_on: PassOn) -> None:
         self.pass_on, self.takes = pass_on, dict[str, Callable[[Any], None]]()
         self.library = replace(ros.load_ros(), rclpy=SimpleNamespace(create_node=self.create_node))
         self.pilot = ros.PilotNode(self.library, mission, ros.Topics(), sim_time=True)
-        rng = np.random.default_rng(seed)
+        rng = np.random.default_rng(1)
         self.vehicle = ros.VehicleNode(self.library, vehicle, "thrusters", rng)
 
     def create_node(self, _: str, *, namespace: str, **others: Any) -> Any:
-        def path(topic: str) -> str:
-            return topic if topic.startswith("/") else f"/{namespace}/{topic}"
+        """What the nodes use of one of rclpy's."""
 
         def publisher(kind: Any, topic: str, qos: Any) -> Any:
-            return SimpleNamespace(publish=partial(self.publish, path(topic)))
+            return SimpleNamespace(publish=partial(self.publish, str(Path("/", namespace, topic))))
 
         def subscription(kind: Any, topic: str, take: Callable[[Any], None], qos: Any) -> None:
-            self.takes[path(topic)] = take
+            self.takes[str(Path("/", namespace, topic))] = take
 
         return SimpleNamespace(create_publisher=publisher, create_subscription=subscription)
 
@@ -63,26 +64,20 @@ class Nodes:
             publisher.publish(message)
         return self.vehicle.speeds()
 
-    @property
-    def is_over(self) -> bool:
-        return self.pilot.mission.loop.state == LinkState.OVER
-
 
 class Submarine:
     """A pilot over MAVLink, and its submarine, which surfaces by itself when told to."""
 
-    def __init__(
-        self, mission: LiveMission, vehicle: SimulatedVehicle, pass_on: PassOn, _: int
-    ) -> None:
+    def __init__(self, mission: LiveMission, vehicle: SimulatedVehicle, pass_on: PassOn) -> None:
         self.vehicle, self.pass_on, self.loops = vehicle, pass_on, InnerLoops(vehicle)
-        self.parsers = dialect.MAVLink(None), dialect.MAVLink(None)
+        self.parser = dialect.MAVLink(None)
         self.own = dialect.MAVLink(None, srcSystem=1, srcComponent=1)
         sends = dialect.MAVLink(self, srcSystem=255, srcComponent=191)
         self.pilot = MavlinkPilot(mission, sends, sim_time=False)
         self.mode, self.target = GUIDED, (np.zeros(3), 0.0)
 
     def write(self, data: bytes) -> None:
-        for message in self.parsers[0].parse_buffer(data) or []:
+        for message in self.parser.parse_buffer(data) or []:
             kind = message.get_type()
             if kind == "COMMAND_LONG" and (message.command, message.param2) == (SET_MODE, SURFACE):
                 self.mode, self.target = SURFACE, (np.array([0.0, 0.0, -0.3]), self.target[1])
@@ -113,12 +108,12 @@ class Submarine:
             heartbeat = own.heartbeat_encode(12, 3, 1 | 128, self.mode, 4)
             messages = [heartbeat, own.gps_global_origin_encode(*place), *messages]
         for message in messages:
-            for heard in self.parsers[1].parse_buffer(message.pack(own)):
+            for heard in self.parser.parse_buffer(message.pack(own)):
                 self.pilot.hear(heard, now_s)
         self.pilot.step(now_s)
         return self.loops.speeds(self.vehicle.world.now, *self.target)
 
     @property
-    def is_over(self) -> bool:
-        surfaced = self.mode == GUIDED or self.vehicle.world.now[2] < 0.3
-        return bool(surfaced and self.pilot.mission.loop.state == LinkState.OVER)
+    def is_safe(self) -> bool:
+        """Whether it is not on its way up by itself."""
+        return bool(self.mode == GUIDED or self.vehicle.world.now[2] < 0.3)

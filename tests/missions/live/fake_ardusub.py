@@ -17,7 +17,6 @@ from alice_survey.core.artefacts import write_csv
 from alice_survey.core.config import SurveyConfig, load_config
 from alice_survey.core.frames import Array, Datum, attitude_from_rotation
 from alice_survey.sim.vehicle.allocation import AXIS_WEIGHTS, allocate, new_allocation
-from alice_survey.sim.vehicle.navigation.sensors import DVL
 from alice_survey.sim.vehicle.pilot.gains import (
     HEAVE,
     MASS,
@@ -29,10 +28,9 @@ from alice_survey.sim.vehicle.pilot.gains import (
     gains_for,
 )
 from alice_survey.sim.vehicle.rotations import wrap_angle
-from alice_survey.sim.vehicle.sea import floor_range
 from alice_survey.sim.vehicle.simulator import SimulatedVehicle
 from missions.live.mission import plan_to_fly
-from tests.missions.live.flights import vehicle_afloat
+from tests.missions.live.flights import altimeter_m, vehicle_afloat
 
 GUIDED, ARMED, SUBMARINE, ARDUPILOT = 4, 128, 12, 3
 AXES = (SURGE, SWAY, HEAVE, YAW)
@@ -121,15 +119,6 @@ def fly(port: int, settings: Path, track: Path) -> None:
         vehicle.move(loops.speeds(truth, *target))
     columns = ("time_s", "north_m", "east_m", "depth_m", "qx", "qy", "qz", "qw")
     write_csv(track, columns, rows)
-
-
-def altimeter_m(vehicle: SimulatedVehicle) -> float:
-    """Range straight down from the DVL's place to the sea floor; 0 is no echo."""
-    truth = vehicle.world.now
-    turn = Rotation.from_quat(truth[3:7])
-    place = truth[:3] + turn.apply(vehicle.parts.sensors.place[DVL])
-    reach = floor_range(vehicle.parts.floor, *place, *turn.apply([0.0, 0.0, 1.0]), 75.0)
-    return reach if math.isfinite(reach) else 0.0
 
 
 def send(link: object, vehicle: SimulatedVehicle, stamp_ms: int, shift: Array) -> None:
