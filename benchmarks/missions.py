@@ -30,6 +30,7 @@ from alice_survey.core.config import AreaConfig, SurveyConfig, change_section, p
 from alice_survey.core.errors import PlanError, keep_warnings
 from alice_survey.core.frames import Array
 from alice_survey.core.records import FlightRecord
+from alice_survey.sim.vehicle.pilot.memory import REASONS, TOUCHED
 from alice_survey.sim.vehicle.sea import FloorGrid, level_floor
 from benchmarks.figures import Figure, Findings, Goal, Parser, hand_over, markdown
 from camera_calib.rig import design_rig
@@ -50,10 +51,8 @@ from missions.values.flight import rms
 from missions.values.plan_file import Plan
 
 FORMATS = {
-    "cola2": "mission_dive1.xml",
-    "wpl": "mission_dive1.waypoints",
-    "qgc": "mission_dive1.plan",
-}
+    "cola2": "mission_dive1.xml", "wpl": "mission_dive1.waypoints", "qgc": "mission_dive1.plan",
+}  # fmt: skip
 _LEVEL = "level"
 _UTM = "EPSG:32636"
 _SPARE = 0.02
@@ -135,7 +134,9 @@ def main() -> None:
     level, terrain = measure(quick=options.quick), over_terrain(quick=options.quick)
     for rows in (level, terrain):
         print(*markdown([row.cells() for row in rows]), sep="\n", flush=True)
-    failed = tuple(f"{r.figure().name}: {r.ending}" for r in level if r.ending != "complete")
+    ended = [row for row in level if row.ending != "complete"]
+    ended += [row for row in terrain if row.ending.endswith(REASONS[TOUCHED])]
+    failed = tuple(f"{row.figure().name}: {row.ending}" for row in ended)
     flown = [row for row in (*level, *terrain) if math.isfinite(row.flown)]
     findings = Findings(figures=tuple(row.figure() for row in flown), failed=failed)
     kept = {"level": [*map(asdict, level)], "terrain": [*map(asdict, terrain)]}

@@ -82,7 +82,7 @@ PARTS = (
         arguments="--angles",
         long=True,
         packages=("coverage_path_planner",),
-    ),
+    ),  # fmt: skip
     Part(name="studio"),
     Part(name="vehicle"),
     Part(name="missions"),

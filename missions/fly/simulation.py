@@ -494,8 +494,9 @@ def _altitude(floor: FloorGrid, points_ned: Array) -> Array:
 
 
 def _clearance_m(setup: Setup, ned_from_body: RigidTransform) -> float:
-    """Least height of hull, port and DVL above the sea floor, of every second."""
-    low, each = setup.sensors.low, ned_from_body[:: round(1.0 / TICK_S)]
+    """Least height of hull, port and DVL above the sea floor, of every second and at the end."""
+    some = np.append(np.arange(0, len(ned_from_body), round(1.0 / TICK_S)), -1)
+    low, each = setup.sensors.low, ned_from_body[some]
     points = np.vstack([each.apply(point) for point in low])
     return float(_altitude(setup.floor, points).min())
 

@@ -32,7 +32,7 @@ class Flight:
     altitude_m: Array
     """(T,) true, of the left port's glass above the sea floor below it."""
     clearance_m: float
-    """Least height of hull, port and DVL above the sea floor, of every second."""
+    """Least height of hull, port and DVL above the sea floor, of every second and at the end."""
     believed_glass_ned: Array
     """(T, 3) where navigation placed it."""
     line: Array

@@ -113,4 +113,5 @@ def test_the_hull_on_the_sea_floor_ends_the_mission_and_says_so() -> None:
     bow = bow + Rotation.from_quat(flight.flown.truth[:, 3:7]).apply(HULL.profile_body_m[0])
     above = np.array([floor_depth(floor, n, e) - d for n, e, d in bow])
     assert above[-1] <= 0.0
+    assert flight.clearance_m <= 0.0
     assert above[:-1].min() > 0.0

@@ -17,8 +17,7 @@ from alice_survey.sim.vehicle.simulator import TICK_S, SimulatedVehicle
 from missions.live import ros
 from missions.live.mavlink_pilot import GUIDED, SURFACE, MavlinkPilot
 from missions.live.mission import LiveMission, Odometry
-from tests.missions.live.fake_ardusub import InnerLoops
-from tests.missions.live.flights import altimeter_m
+from tests.missions.live.fake_ardusub import InnerLoops, altimeter_m
 
 PassOn = Callable[[Odometry], tuple[Odometry, str]]
 """What arrives of odometry that is sent, and the name of its frame."""

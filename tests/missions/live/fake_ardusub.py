@@ -1,7 +1,8 @@
-"""A vehicle that speaks MAVLink as ArduSub in GUIDED does: `python -m ... PORT SETTINGS TRACK`.
+"""A vehicle that speaks MAVLink as ArduSub does: `python -m ... PORT SETTINGS TRACK [FAULT]`.
 
 Its dynamics are the simulator's; loops of its own turn velocity and heading into a wrench. It goes
-on when the set-point of a tick has come, and ends when none comes any more at the surface.
+on when the set-point of a tick has come, and ends when none comes any more at the surface, or when
+it is told to surface. With a fault, "nan" or "frozen", its position is so from `FAULT_S` on.
 """
 
 import math
@@ -17,6 +18,7 @@ from alice_survey.core.artefacts import write_csv
 from alice_survey.core.config import SurveyConfig, load_config
 from alice_survey.core.frames import Array, Datum, attitude_from_rotation
 from alice_survey.sim.vehicle.allocation import AXIS_WEIGHTS, allocate, new_allocation
+from alice_survey.sim.vehicle.navigation.sensors import DVL
 from alice_survey.sim.vehicle.pilot.gains import (
     HEAVE,
     MASS,
@@ -28,11 +30,13 @@ from alice_survey.sim.vehicle.pilot.gains import (
     gains_for,
 )
 from alice_survey.sim.vehicle.rotations import wrap_angle
+from alice_survey.sim.vehicle.sea import floor_range
 from alice_survey.sim.vehicle.simulator import SimulatedVehicle
 from missions.live.mission import plan_to_fly
-from tests.missions.live.flights import altimeter_m, vehicle_afloat
+from tests.missions.live.flights import vehicle_afloat
 
 GUIDED, ARMED, SUBMARINE, ARDUPILOT = 4, 128, 12, 3
+FAULT_S, SET_MODE = 20.0, 176
 AXES = (SURGE, SWAY, HEAVE, YAW)
 
 
@@ -67,7 +71,7 @@ class InnerLoops:
         return self.allocation.command.copy()
 
 
-def fly(port: int, settings: Path, track: Path) -> None:
+def fly(port: int, settings: Path, track: Path, fault: str = "") -> None:
     survey: SurveyConfig = load_config(settings)
     plan = plan_to_fly(settings.parent, None)
     vehicle = vehicle_afloat(plan, survey)
@@ -80,16 +84,19 @@ def fly(port: int, settings: Path, track: Path) -> None:
     shift = plan.datum.ned_from_geodetic(
         np.array([[origin.latitude_deg, origin.longitude_deg, 0.0]])
     )[0]
-    target, answered_ms, dived = (np.zeros(3), 0.0), -1, False
+    target, answered_ms, dived, mode = (np.zeros(3), 0.0), -1, False, GUIDED
+    spoilt = np.full(13, np.nan)
     rows: list[list[float]] = []
 
     def hear(message: object) -> None:
-        nonlocal target, answered_ms
+        nonlocal target, answered_ms, mode
         kind = message.get_type()  # type: ignore[attr-defined]
         if kind == "COMMAND_LONG" and message.command == 512:  # type: ignore[attr-defined]
             link.mav.gps_global_origin_send(
                 round(origin.latitude_deg * 1e7), round(origin.longitude_deg * 1e7), 0
             )
+        if kind == "COMMAND_LONG" and message.command == SET_MODE:  # type: ignore[attr-defined]
+            mode = round(message.param2)  # type: ignore[attr-defined]
         if kind == "SET_POSITION_TARGET_LOCAL_NED":
             m = message
             heading = m.yaw if not m.type_mask & 1024 else target[1]  # type: ignore[attr-defined]
@@ -102,6 +109,8 @@ def fly(port: int, settings: Path, track: Path) -> None:
         truth = vehicle.world.now
         rows.append([vehicle.tick * 0.05, *truth[:7].tolist()])
         stamp_ms = 1000 + 50 * vehicle.tick
+        if fault == "frozen" and vehicle.tick * 0.05 <= FAULT_S:
+            spoilt = truth.copy()
         sent, asked = -math.inf, time.monotonic()
         while answered_ms < stamp_ms:
             waited_s = time.monotonic() - asked
@@ -109,7 +118,10 @@ def fly(port: int, settings: Path, track: Path) -> None:
                 break
             if time.monotonic() - sent > 0.25:
                 sent = time.monotonic()
-                send(link, vehicle, stamp_ms, shift)
+                is_wrong = bool(fault) and vehicle.tick * 0.05 > FAULT_S
+                send(link, vehicle, stamp_ms, shift, spoilt if is_wrong else truth, mode)
+                if mode != GUIDED:
+                    return
             message = link.recv_match(blocking=True, timeout=0.05)
             if message is not None:
                 hear(message)
@@ -121,15 +133,27 @@ def fly(port: int, settings: Path, track: Path) -> None:
     write_csv(track, columns, rows)
 
 
-def send(link: object, vehicle: SimulatedVehicle, stamp_ms: int, shift: Array) -> None:
-    mav, truth = link.mav, vehicle.world.now  # type: ignore[attr-defined]
+def altimeter_m(vehicle: SimulatedVehicle) -> float:
+    """Range straight down from the DVL's place to the sea floor; 0 is no echo."""
+    truth = vehicle.world.now
     turn = Rotation.from_quat(truth[3:7])
-    roll, pitch, heading = attitude_from_rotation(turn)
-    mav.heartbeat_send(SUBMARINE, ARDUPILOT, 1 | ARMED, GUIDED, 4)
+    north, east, depth = truth[:3] + turn.apply(vehicle.parts.sensors.place[DVL])
+    x, y, z = turn.apply([0.0, 0.0, 1.0])
+    reach = floor_range(vehicle.parts.floor, north, east, depth, x, y, z, 75.0)
+    return reach if math.isfinite(reach) else 0.0
+
+
+def send(
+    link: object, vehicle: SimulatedVehicle, stamp_ms: int, shift: Array, said: Array, mode: int
+) -> None:
+    mav, truth = link.mav, vehicle.world.now  # type: ignore[attr-defined]
+    shown = said if np.all(np.isfinite(said)) else truth
+    roll, pitch, heading = attitude_from_rotation(Rotation.from_quat(shown[3:7]))
+    mav.heartbeat_send(SUBMARINE, ARDUPILOT, 1 | ARMED, mode, 4)
     mav.attitude_send(stamp_ms, roll, pitch, heading, *truth[10:13])
     mav.rangefinder_send(altimeter_m(vehicle), 0.0)
-    mav.local_position_ned_send(stamp_ms, *(truth[:3] - shift), *truth[7:10])
+    mav.local_position_ned_send(stamp_ms, *(said[:3] - shift), *said[7:10])
 
 
 if __name__ == "__main__":
-    fly(int(sys.argv[1]), Path(sys.argv[2]), Path(sys.argv[3]))
+    fly(int(sys.argv[1]), Path(sys.argv[2]), Path(sys.argv[3]), *sys.argv[4:])

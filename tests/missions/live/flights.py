@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation
 from alice_survey.core.artefacts import read_csv, write_json
 from alice_survey.core.config import SurveyConfig
 from alice_survey.core.frames import Array
-from alice_survey.sim.vehicle.navigation.sensors import DVL
-from alice_survey.sim.vehicle.sea import floor_range, level_floor
+from alice_survey.sim.vehicle.sea import level_floor
 from alice_survey.sim.vehicle.simulator import SimulatedVehicle
 from missions.fly.simulation import flight_settings, mission_setup
 from missions.live.mission import LinkLimits, LiveMission, Odometry, mission_of
@@ -54,16 +53,6 @@ def vehicle_afloat(plan: Plan, survey: SurveyConfig, seed: int = 1) -> Simulated
     return SimulatedVehicle(setup, rng)
 
 
-def altimeter_m(vehicle: SimulatedVehicle) -> float:
-    """Range straight down from the DVL's place to the sea floor; 0 is no echo."""
-    truth = vehicle.world.now
-    turn = Rotation.from_quat(truth[3:7])
-    north, east, depth = truth[:3] + turn.apply(vehicle.parts.sensors.place[DVL])
-    x, y, z = turn.apply([0.0, 0.0, 1.0])
-    reach = floor_range(vehicle.parts.floor, north, east, depth, x, y, z, 75.0)
-    return reach if math.isfinite(reach) else 0.0
-
-
 class LoopFlight:
     """A loop that flies a simulated vehicle by its true motion; tests spoil what it hears."""
 
@@ -94,6 +83,13 @@ class LoopFlight:
             velocity_body=velocity, rates_body=truth[10:],
         )  # fmt: skip
 
+    def true_range(self) -> float:
+        """Of the altimeter at the DVL's place to the level floor."""
+        turn = Rotation.from_quat(self.truth[3:7])
+        place = SurveyConfig().camera.dvl_position_body_m
+        down = float(turn.apply([0.0, 0.0, 1.0])[2])
+        return float(FLOOR_M - self.truth[2] - turn.apply(place)[2]) / down
+
     def ticks(self, count: int, **spoilt: Any) -> None:
         for _ in range(count):
             self.tick(**spoilt)
@@ -106,7 +102,7 @@ class LoopFlight:
         elif odometry == "true":
             self.loop.hear_odometry(self.true_odometry(), self.now_s)
         if altitude:
-            self.loop.hear_range(self.now_s, altimeter_m(self.vehicle), self.now_s)
+            self.loop.hear_range(self.now_s, self.true_range(), self.now_s)
         self.command = self.mission.tick(self.now_s)
         point = SurveyConfig().camera.position_body_m
         self.glass.append(self.truth[:3] + Rotation.from_quat(self.truth[3:7]).apply(point))

@@ -16,7 +16,7 @@ from alice_survey.sim.vehicle.pilot.memory import SIGMA_M
 from missions.live.mission import LinkState, Odometry
 from missions.values.flight import trigger_times
 from tests.missions.flown_plans import flown
-from tests.missions.live.flights import FLOOR_M, LoopFlight, altimeter_m, small_plan
+from tests.missions.live.flights import FLOOR_M, LoopFlight, small_plan
 
 GRACE_TICKS = 100
 
@@ -245,7 +245,7 @@ def test_altitude_is_that_of_a_level_floor_below_a_tilted_vehicle() -> None:
         flight.truth[2] = 3.0
         flight.vehicle.tick += 1
         flight.loop.hear_odometry(flight.true_odometry(), flight.now_s)
-        flight.loop.hear_range(flight.now_s, altimeter_m(flight.vehicle), flight.now_s)
+        flight.loop.hear_range(flight.now_s, flight.true_range(), flight.now_s)
         flight.loop.tick(flight.now_s)
         point = turn.apply(SurveyConfig().camera.position_body_m)
         estimate = flight.loop.estimate

@@ -186,24 +186,19 @@ def test_vehicle_without_an_origin_is_given_the_datum() -> None:
     assert not vehicle.targets()
 
 
-@pytest.mark.slow
-def test_dive_over_udp(tmp_path: Path) -> None:
+def dive_over_udp(folder: Path, *fault: str) -> subprocess.CompletedProcess[str]:
     """The command flies a vehicle of another process, whose own loops follow the set-points."""
-    settings = workspace_in(tmp_path) / "survey.toml"
+    settings = workspace_in(folder) / "survey.toml"
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    track, record = tmp_path / "track.csv", tmp_path / "record.csv"
-    fake = subprocess.Popen(
-        [
-            sys.executable, "-m", "tests.missions.live.fake_ardusub", str(port), str(settings),
-            str(track),
-        ]
-    )  # fmt: skip
+    track, record = folder / "track.csv", folder / "record.csv"
+    program = [sys.executable, "-m", "tests.missions.live.fake_ardusub"]
+    fake = subprocess.Popen([*program, str(port), str(settings), str(track), *fault])
     try:
         ended = subprocess.run(
             [
-                sys.executable, "-m", "alice_survey", "pilot", "-w", str(tmp_path), "--sim-time",
+                sys.executable, "-m", "alice_survey", "pilot", "-w", str(folder), "--sim-time",
                 "--mavlink", f"udpin:127.0.0.1:{port}", "--record", str(record), "--json",
             ],
             capture_output=True, text=True, timeout=900, check=False,
@@ -211,6 +206,24 @@ def test_dive_over_udp(tmp_path: Path) -> None:
         fake.wait(240)
     finally:
         fake.kill()
+    return ended
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("fault", "why"), [("nan", "not a number"), ("frozen", "not change")])
+def test_wrong_positions_over_udp_end_with_exit_code_3(
+    tmp_path: Path, fault: str, why: str
+) -> None:
+    ended = dive_over_udp(tmp_path, fault)
+    assert ended.returncode == 3, ended.stderr
+    found = json.loads(ended.stdout)
+    assert found["ending"].startswith("given up")
+    assert any(why in kind for kind in found["refused"])
+
+
+@pytest.mark.slow
+def test_dive_over_udp(tmp_path: Path) -> None:
+    ended, track, record = dive_over_udp(tmp_path), tmp_path / "track.csv", tmp_path / "record.csv"
     assert ended.returncode == 0, ended.stderr
     assert json.loads(ended.stdout)["ending"] == "complete"
 
