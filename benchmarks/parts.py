@@ -71,18 +71,13 @@ class Part:
 
 
 _WORK = ("work",)
+_PEER = ("coverage_path_planner",)
 PARTS = (
     Part(name="camera-speed", module="camera", arguments="--only speed"),
     Part(name="camera-pose", module="camera", arguments="--only pose"),
     Part(name="camera-calibration", module="camera", arguments="--only calibration target"),
-    Part(name="planner", packages=("coverage_path_planner",)),
-    Part(
-        name="planner-angles",
-        module="planner",
-        arguments="--angles",
-        long=True,
-        packages=("coverage_path_planner",),
-    ),  # fmt: skip
+    Part(name="planner", packages=_PEER),
+    Part(name="planner-angles", module="planner", arguments="--angles", long=True, packages=_PEER),
     Part(name="studio"),
     Part(name="vehicle"),
     Part(name="missions"),
