@@ -175,7 +175,9 @@ def run_images(
     rows = read_columns(triggers, ("station", "time_s"))
     stations = [(int(s), float(t)) for s, t in zip(*rows.values(), strict=True)]
     if not stations:
-        raise NavigationError(f"{triggers} holds no trigger: plan a larger area")
+        raise NavigationError(
+            f"{triggers} holds no trigger: {flight / 'flight.json'} says how it ended"
+        )
     truth = read_track(track)
     believed = _believed_records(navigation, np.array([t for _, t in stations]))
     rig = true_rig(camera, water, scale=imaging.scale, seed=seed)

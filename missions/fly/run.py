@@ -189,7 +189,10 @@ def _flight_figure(flight: Flight) -> Any:
             time_s[some], -band, band, color=INKS[1], alpha=0.18, lw=0,
             label=f"±{_SIGMAS:g} logged sigmas",
         )  # fmt: skip
-    strips[0].set_title(f"{rms(cross):.3f} m rms on lines, heading {np.rad2deg(rms(heading)):.1f}°")
+    if np.isfinite(cross).any():
+        strips[0].set_title(
+            f"{rms(cross):.3f} m rms on lines, heading {np.rad2deg(rms(heading)):.1f}°"
+        )
     for axes in strips:
         axes.legend(loc="upper right", ncol=5, fontsize=7.5)
         axes.tick_params(labelbottom=axes is strips[-1])
