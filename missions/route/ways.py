@@ -53,6 +53,14 @@ class _Visibility(NamedTuple):
     corners: NDArray[np.intp]
     lengths_m: Array
 
+    def by_place(self, count: int) -> list[slice]:
+        """The rows of each of so many places."""
+        return list(map(slice, *np.searchsorted(self.places, np.arange(count) + [[0], [1]])))
+
+    def of(self, rows: slice) -> "_Visibility":
+        """Some rows."""
+        return _Visibility(*(column[rows] for column in self))
+
 
 class Ways:
     """The ways inside an allowed area; between parts that do not touch there is none."""
@@ -67,7 +75,7 @@ class Ways:
         self._water = shapely.buffer(allowed, TOUCH_M, join_style="mitre")
         shapely.prepare(self._water)
         self._convex = self._water.covers(allowed.convex_hull)
-        self._from_corner: dict[int, Array] = {}
+        self._from_corner: dict[int, tuple[Array, NDArray[np.int32]]] = {}
 
     def inside(self, places_ne: Array) -> NDArray[np.bool_]:
         """Which places, (N, 2), are inside."""
@@ -192,12 +200,20 @@ class Ways:
             return distances
         rows = np.flatnonzero(np.isinf(distances).any(axis=1))
         columns = np.flatnonzero(np.isinf(distances).any(axis=0))
-        sight = self._sight(b[columns])
-        for block in np.array_split(rows, 1 + len(rows) * len(sight.places) // (16 * _BLOCK)):
-            through = self._through(a[block], sight.corners) + sight.lengths_m
-            over = _least(through.T, sight.places, len(columns)).T
-            here = np.ix_(block, columns)
-            distances[here] = np.where(np.isinf(distances[here]), over, distances[here])
+        far = self._sight(b[columns])
+        near = far if a is b else self._sight(a[rows])
+        if not len(near.corners) or not len(far.corners):
+            return distances
+        firsts, lasts = np.unique(near.corners), np.unique(far.corners)
+        between = np.array([lengths_m[lasts] for lengths_m, _ in self._from(firsts)])
+        first, last = np.searchsorted(firsts, near.corners), np.searchsorted(lasts, far.corners)
+        reached, begins = np.unique(far.places, return_index=True)
+        for i, seen in zip(rows.tolist(), near.by_place(len(rows)), strict=True):
+            if seen.stop > seen.start:
+                through = (near.lengths_m[seen, None] + between[first[seen]]).min(axis=0)
+                over = np.minimum.reduceat(through[last] + far.lengths_m, begins)
+                found = distances[i, columns[reached]]
+                distances[i, columns[reached]] = np.where(np.isinf(found), over, found)
         return distances
 
     def lengths_m(self, starts_ne: Array, ends_ne: Array) -> Array:
@@ -206,10 +222,10 @@ class Ways:
         lengths: Array = np.hypot(*(ends_ne - starts_ne).T)
         lengths[blocked] = np.inf
         if len(blocked) and len(self._nodes):
-            sight = self._sight(ends_ne[blocked])
-            through = self._through(starts_ne[blocked], sight.corners)
-            over = through[sight.places, np.arange(len(sight.places))] + sight.lengths_m
-            lengths[blocked] = _least(over, sight.places, len(blocked))
+            near, far = self._sight(starts_ne[blocked]), self._sight(ends_ne[blocked])
+            both = near.by_place(len(blocked)), far.by_place(len(blocked))
+            for i, here, there in zip(blocked.tolist(), *both, strict=True):
+                lengths[i] = self._through(near.of(here), far.of(there)).min(initial=np.inf)
         return lengths
 
     def path_ne(self, a: Place, b: Place) -> Array:
@@ -227,22 +243,18 @@ class Ways:
                 "move it, or widen area.turn_margin_m or the allowed area"
             )
         near, far = self._sight(ends[:1]), self._sight(ends[1:])
-        through, before = np.full((1, 1), np.inf), np.empty((0, 0), np.int32)
-        if len(near.corners) and len(far.corners):
-            between, before = dijkstra(
-                self._graph, directed=False, indices=near.corners, return_predecessors=True
-            )
-            through = near.lengths_m[:, None] + between[:, far.corners] + far.lengths_m
-        first, last = np.unravel_index(np.argmin(through), through.shape)
-        if math.isinf(through[first, last]):
+        through = self._through(near, far)
+        if math.isinf(through.min(initial=np.inf)):
             raise PlanError(
                 f"no way inside the allowed area from {a[0]:.2f} m north, {a[1]:.2f} m east to "
                 f"{b[0]:.2f} m north, {b[1]:.2f} m east: its parts are not connected; widen "
                 "the allowed area (area.turn_margin_m), or survey the parts one by one"
             )
+        first, last = np.unravel_index(np.argmin(through), through.shape)
+        ((_, before),) = self._from(near.corners[[first]])
         chain = [int(far.corners[last])]
         while chain[-1] != near.corners[first]:
-            chain.append(int(before[first, chain[-1]]))
+            chain.append(int(before[chain[-1]]))
         path = np.concatenate([ends[:1], self._nodes[chain[::-1], :2], ends[1:]])
         moves = np.linalg.norm(np.diff(path, axis=0), axis=1) > TOUCH_M
         moves[-1] |= not moves.any()
@@ -310,19 +322,21 @@ class Ways:
         place, corner = place[free], corner[free]
         return _Visibility(place, corner, np.hypot(*(corners[corner] - places_ne[place]).T))
 
-    def _through(self, places_ne: Array, goals: NDArray[np.intp]) -> Array:
-        """Lengths, (N, G), of the shortest ways over corners from places to corners, all kept."""
-        sight = self._sight(places_ne)
-        new = [node for node in np.unique(sight.corners).tolist() if node not in self._from_corner]
+    def _through(self, near: _Visibility, far: _Visibility) -> Array:
+        """Lengths, (K, M), of the ways over each corner near one place and each near another."""
+        between = [lengths_m[far.corners] for lengths_m, _ in self._from(near.corners)]
+        shape = len(near.corners), len(far.corners)
+        through: Array = near.lengths_m[:, None] + np.reshape(between, shape) + far.lengths_m
+        return through
+
+    def _from(self, corners: NDArray[np.intp]) -> list[tuple[Array, NDArray[np.int32]]]:
+        """Lengths, (V,), of the shortest ways from corners to all, and the corners before; kept."""
+        listed = corners.tolist()
+        new = sorted(set(listed) - self._from_corner.keys())
         if new:
-            found = dijkstra(self._graph, directed=False, indices=new)
-            self._from_corner |= dict(zip(new, found, strict=True))
-        if not len(sight.corners):
-            return np.full((len(places_ne), len(goals)), np.inf)
-        goals, column = np.unique(goals, return_inverse=True)
-        between = np.array([self._from_corner[node][goals] for node in sight.corners.tolist()])
-        lengths = _least(sight.lengths_m[:, None] + between, sight.places, len(places_ne))
-        return lengths[:, column]
+            found = dijkstra(self._graph, directed=False, indices=new, return_predecessors=True)
+            self._from_corner |= dict(zip(new, zip(*found, strict=True), strict=True))
+        return [self._from_corner[corner] for corner in listed]
 
 
 @compiled
@@ -373,15 +387,6 @@ def _crossings(starts: Array, ends: Array, edges: Array, boxes: Array) -> NDArra
             if met[i] == _CROSSED:
                 break
     return met
-
-
-def _least(values: Array, owners: NDArray[np.intp], count: int) -> Array:
-    """The least of the rows, (K, ...), of each owner, ascending: (count, ...), inf of no rows."""
-    least = np.full((count, *values.shape[1:]), np.inf)
-    known, firsts = np.unique(owners, return_index=True)
-    if len(known):
-        least[known] = np.minimum.reduceat(values, firsts, axis=0)
-    return least
 
 
 def edges_of(polygons: MultiPolygon) -> Array:
