@@ -36,7 +36,7 @@ COARSE_M = 0.05
 """How far ways that only order lines may cut corners: far less than a turn costs."""
 SMALL_M = 10.0
 """Girth of zones that ways for choosing a heading pass over: a detour round them is some 2 m."""
-_BLOCK = 1 << 20
+_BLOCK = 1 << 15
 """Pairs of places and corners that are looked at together."""
 _TOGETHER = 8
 """Edges of the area that share a box."""
