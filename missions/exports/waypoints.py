@@ -349,7 +349,7 @@ def gone_on(plan: Plan, point: Waypoint, tolerance_m: float) -> Waypoint:
 def room_m(plan: Plan, place_ne: Array, way_ne: Array) -> float:
     """How far of a way from a place the glass may go."""
     way = LineString([place_ne, place_ne + way_ne])
-    inside = shapely.get_parts(way.intersection(plan.area.allowed.buffer(_TOUCH_M)))
+    inside = shapely.get_parts(way.intersection(plan.area.touched))
     parts = [part for part in inside if part.distance(Point(place_ne)) <= _TOUCH_M]
     return min(way.length, max((float(part.length) for part in parts), default=0.0))
 

@@ -5,6 +5,7 @@ east first swap them.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,8 @@ from shapely.geometry import MultiPolygon, mapping, shape
 
 from alice_survey.core.errors import PlanError
 from alice_survey.core.frames import Array, Datum
+
+_TOUCH_M = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,6 +46,11 @@ class Area:
     def allowed_corners_ne(self) -> Array:
         """(N, 2) corners of the allowed area: what a simulated sea floor must reach to."""
         return shapely.get_coordinates(self.allowed)
+
+    @cached_property
+    def touched(self) -> shapely.Geometry:
+        """The allowed area and its edge, whatever rounding does to what lies on it."""
+        return self.allowed.buffer(_TOUCH_M)
 
     @property
     def rings_ne(self) -> list[Array]:

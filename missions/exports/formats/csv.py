@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from alice_survey.core.artefacts import write_csv
 from missions.exports.format import Export, ExportFile, ExportFormat
 from missions.exports.geometry import dive_of_line, lat_lon, line_depths, line_ends_deg
@@ -47,15 +49,14 @@ def _stations(plan: Plan) -> Iterator[dict[str, Any]]:
         floors = plan.line_floors_m[index] if plan.line_floors_m else depths + plan.altitude_m
         places = line.stations_ne
         places_deg = lat_lon(plan.datum, places, glass_m)
-        for (north, east), (lat, lon), depth, floor in zip(
-            places, places_deg, depths, floors, strict=True
-        ):
+        heading_deg = f"{math.degrees(line.heading_rad):.6f}"
+        columns = np.column_stack([places, places_deg, depths, floors - depths])
+        for north, east, lat, lon, depth, altitude in columns.tolist():
             yield {
                 "station": next(number), "dive": dive_of.get(index), "line": index,
                 "kind": line.kind, "latitude_deg": f"{lat:.10f}", "longitude_deg": f"{lon:.10f}",
                 "north_m": f"{north:.4f}", "east_m": f"{east:.4f}", "depth_m": f"{depth:.3f}",
-                "altitude_m": f"{floor - depth:.3f}",
-                "heading_deg": f"{math.degrees(line.heading_rad):.6f}",
+                "altitude_m": f"{altitude:.3f}", "heading_deg": heading_deg,
             }  # fmt: skip
 
 

@@ -3,7 +3,6 @@
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import shapely
@@ -19,6 +18,8 @@ from missions.exports.geometry import (
     map_features,
 )
 
+_FEATURE = '{{"type": "Feature", "properties": {}, "geometry": {}}}'
+
 
 def write_geojson(path: Path, export: Export, _dive: int) -> None:
     """Write what a plan holds, of the left port's glass; footprints are of the first camera."""
@@ -32,7 +33,8 @@ def write_geojson(path: Path, export: Export, _dive: int) -> None:
 def _features(export: Export) -> Iterator[str]:
     plan = export.plan
     for one in map_features(plan):
-        yield _text(one.role, {"name": one.name, **one.about}, str(shapely.to_geojson(one.shape)))
+        about = json.dumps({"role": one.role, "name": one.name, **one.about}, allow_nan=False)
+        yield _FEATURE.format(about, shapely.to_geojson(one.shape))
     floor_m, glass_m = plan.seafloor_depth_m, plan.seafloor_depth_m - plan.altitude_m
     outline = footprint_outline(plan, export.rig)
     if not shapely.LinearRing(outline[:, ::-1]).is_ccw:  # east before north, as in the file
@@ -47,16 +49,12 @@ def _features(export: Export) -> Iterator[str]:
             "footprint": shapely.polygons(corners.reshape(line.stations, -1, 2)),
         }
         texts = [(role, shapely.to_geojson(np.asarray(found))) for role, found in shapes.items()]
+        of = f'"line": {index}, "dive": {json.dumps(dives.get(index))}'
         for i in range(line.stations):
-            about = {"station": station + i, "line": index, "dive": dives.get(index)}
             for role, geometries in texts:
-                yield _text(role, about, geometries[i])
+                about = f'{{"role": "{role}", "station": {station + i}, {of}}}'
+                yield _FEATURE.format(about, geometries[i])
         station += line.stations
-
-
-def _text(role: str, about: dict[str, Any], geometry: str) -> str:
-    properties = json.dumps({"role": role, **about}, allow_nan=False)
-    return f'{{"type": "Feature", "properties": {properties}, "geometry": {geometry}}}'
 
 
 FORMAT = ExportFormat(
