@@ -97,13 +97,6 @@ def plan_survey(config: SurveyConfig, rig: Rig, *, max_cells: int | None = None)
         _warn_of_hull(vehicle.name, area, clearance_m, hull, glass_body_m)
         home = _home(plan.home_ne_m, area)
         costs = survey_costs(config, imaging_w=imaging.imaging_w)
-        set_depth_m = config.area.seafloor_depth_m - plan.altitude_m
-        warn_of_swell(
-            energy.flight_conditions(plan, config.vehicle, config.sea, set_depth_m, glass_body_m),
-            config.sea,
-            depth_m,
-            below_m,
-        )
         flown = plan_parts(
             area,
             energy.without_stops(plan, vehicle),
@@ -155,6 +148,12 @@ def plan_survey(config: SurveyConfig, rig: Rig, *, max_cells: int | None = None)
             line_depths_m=depths_m,
             line_floors_m=floors_m,
             details={},
+        )
+        set_depth_m = config.area.seafloor_depth_m - plan.altitude_m
+        warn_of_swell(
+            energy.flight_conditions(plan, config.vehicle, config.sea, set_depth_m, glass_body_m),
+            config.sea,
+            laid,
         )
         if bathymetry is not None and figures is not None:
             ways_m = [

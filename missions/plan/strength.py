@@ -9,14 +9,27 @@ import numpy as np
 
 from alice_survey.core.config import PlanConfig, SeaConfig, SurveyConfig
 from alice_survey.core.errors import PlanError, warn
-from alice_survey.sim.vehicle.pilot.gains import STEADY_SHARE
+from alice_survey.sim.vehicle.pilot.gains import (
+    INTEGRAL,
+    LAG,
+    PLACE,
+    RATE,
+    STEADY_SHARE,
+    SWAY,
+    Gains,
+    gains_for,
+    linear_damping,
+)
 from alice_survey.sim.vehicle.sea import orbital_speed_mps
 from alice_survey.sim.vehicle.steady import fin_flight, min_speed_mps, too_slow
 from alice_survey.sim.vehicle.vehicle import Vehicle
 from missions.exposure.conflict import conflict, last_that_fits
 from missions.route import energy
 from missions.values.costs import Costs
-from missions.values.plan_file import Dive
+from missions.values.plan_file import Dive, Plan
+
+_DRAG_PASSES = 20
+"""Each halves what the drag's amplitude is off."""
 
 
 def survey_costs(config: SurveyConfig, *, imaging_w: float = 0.0) -> Costs:
@@ -116,30 +129,66 @@ def held_current_mps(conditions: energy.FlightConditions) -> float:
     return math.floor(100.0 * last_that_fits(flies, 0.0, size, 1e-3)) / 100.0
 
 
-def warn_of_swell(
-    flown: energy.FlightConditions, sea: SeaConfig, depth_m: float, below_m: float
-) -> None:
-    """Warn where swell moves the water faster, with the current, than the vehicle holds.
+def warn_of_swell(flown: energy.FlightConditions, sea: SeaConfig, plan: Plan) -> None:
+    """Warn where swell carries the vehicle off its lines, or is more than it holds.
 
     Args:
         flown: conditions in the mean current.
         sea: its swell.
-        depth_m: of the sea floor.
-        below_m: how far below the surface the vehicle flies.
+        plan: where the vehicle flies; its lines.
     """
     if sea.swell_m == 0.0:
         return
-    swell_mps = float(orbital_speed_mps(sea.swell_m, sea.swell_period_s, depth_m, below_m))
+    period_s, depth_m = sea.swell_period_s, plan.seafloor_depth_m
+    below_m = depth_m - plan.altitude_m
+    swell_mps = float(orbital_speed_mps(sea.swell_m, period_s, depth_m, below_m))
     towards = math.radians(sea.swell_towards_deg)
     way = np.array([math.cos(towards), math.sin(towards)])
     crests = [flown.current_ne_mps + sign * swell_mps * way for sign in (1.0, -1.0)]
-    if all(energy.flies_everywhere(replace(flown, current_ne_mps=crest)) for crest in crests):
+    is_held = all(energy.flies_everywhere(replace(flown, current_ne_mps=crest)) for crest in crests)
+    across = np.abs(np.sin([line.heading_rad - towards for line in plan.lines]))
+    gains = gains_for(flown.vehicle, flown.speed_mps)
+    shares, of = np.unique(np.round(across, 6), return_inverse=True)
+    offsets_m = np.array(
+        [swell_offset_m(gains, flown.speed_mps, share * swell_mps, period_s) for share in shares]
+    )[of]
+    within = np.clip(plan.allowed_offset_m / np.maximum(offsets_m, 1e-9), 0.0, 1.0)
+    stations = np.array([line.stations for line in plan.lines])
+    off = round(float(stations @ np.arccos(within)) * 2.0 / math.pi)
+    if is_held and not off:
         return
+    beyond = "" if is_held else ", more than it holds,"
     warn(
-        f"swell of {sea.swell_m:g} m every {sea.swell_period_s:g} s moves the water by up to "
-        f"{swell_mps:.2f} m/s where {flown.vehicle.name} flies, more than it holds: it is carried "
-        "off its lines and back by every wave; wait for less swell, or raise side_overlap"
+        f"swell of {sea.swell_m:g} m every {period_s:g} s moves the water by up to "
+        f"{swell_mps:.2f} m/s where {flown.vehicle.name} flies{beyond} and puts some {off} of "
+        f"{plan.stations} pictures more than {plan.allowed_offset_m:.2f} m off their lines: wait "
+        f"for less swell, lay lines along it (line_heading_deg = {sea.swell_towards_deg % 180:g}), "
+        "or raise side_overlap"
     )
+
+
+def swell_offset_m(gains: Gains, speed_mps: float, swell_mps: float, period_s: float) -> float:
+    """How far waves carry the vehicle to either side of its line, where thrusters are not cut.
+
+    Water that moves with u pushes a neutral body at v by M u' + D (u - v); the sway loop answers
+    with M (rate s + place + integral / s) x / (1 + lag s). Quadratic drag counts as the linear one
+    that takes as much energy out of a sine, 8 / (3 pi) of it at the speed's amplitude.
+
+    Args:
+        gains: of the vehicle.
+        speed_mps: along the line.
+        swell_mps: amplitude of the water's speed across the line.
+        period_s: of the waves.
+    """
+    body, row, s = gains.body, gains.axes[SWAY], 2j * math.pi / period_s
+    loop = (row[RATE] * s + row[PLACE] + row[INTEGRAL] / s) / (1.0 + row[LAG] * s)
+    relative_mps, offset_s = swell_mps, 0.0 + 0.0j
+    for _ in range(_DRAG_PASSES):
+        nu = np.array([speed_mps, 4.0 / (3.0 * math.pi) * relative_mps, 0.0, 0.0, 0.0, 0.0])
+        decay = linear_damping(body, nu)[1, 1] / body.mass[1, 1]
+        offset_s = (s + decay) / (s * s + decay * s + loop)
+        relative_mps = (relative_mps + abs(1.0 - s * offset_s) * swell_mps) / 2.0
+    return abs(offset_s) * swell_mps
 
 
 def check_turns(plan: PlanConfig) -> None:

@@ -55,7 +55,8 @@ class _Visibility(NamedTuple):
 
     def by_place(self, count: int) -> list[slice]:
         """The rows of each of so many places."""
-        return list(map(slice, *np.searchsorted(self.places, np.arange(count) + [[0], [1]])))
+        bounds = np.searchsorted(self.places, np.arange(count + 1)).tolist()
+        return list(map(slice, bounds, bounds[1:]))
 
     def of(self, rows: slice) -> "_Visibility":
         """Some rows."""
