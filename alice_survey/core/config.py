@@ -286,7 +286,7 @@ class PlanConfig(Config):
     speed_mps: float = setting(0.2, "over ground", ge=0.01, le=3)
     forward_overlap: float = setting(0.6, "of pictures along the line", ge=0, le=0.95)
     line_spacing_m: float | None = setting(
-        None, "between lines: the paper's; or, instead of it, the next key",
+        None, "between lines: the paper's at 2 m; at other altitudes set the next key instead",
         template="1.0", gt=0, le=20,
     )  # fmt: skip
     side_overlap: float = setting(
@@ -366,7 +366,7 @@ class VehicleConfig(Config):
         "calibrated", "estimated, cfd, calibrated, computed from the shape; or a file",
     )  # fmt: skip
     controller: Literal["sway", "los"] = setting(
-        "sway", "sway: heading held on the line; los: heading to a point ahead on it"
+        "sway", "sway: heading held on the line; los, and without sway: to a point ahead on it"
     )
     allocation: Literal["exact", "rpi"] = setting(
         "exact", "exact (bounded least squares) or rpi (the paper's)"

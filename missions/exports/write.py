@@ -9,7 +9,7 @@ from typing import Any
 
 from alice_survey.core.artefacts import EXPORTS, atomic_path, read_stage, renew_outputs
 from alice_survey.core.config import SurveyConfig, parse_config
-from alice_survey.core.errors import PlanError, warn
+from alice_survey.core.errors import PlanError, note, warn
 from alice_survey.core.run import progress
 from alice_survey.kit.words import count
 from alice_survey.sim.vehicle.pilot.mission import MIN_RADIUS_M, MIN_SPEED_MPS, Cola2Settings
@@ -269,6 +269,8 @@ def _cola2(export: Export, *, chosen: bool) -> list[str]:
             f"{expected}: lay lines along the current (line_heading_deg = {towards_deg:.0f}), wait "
             "for less of it, or fly another autopilot's mission"
         )
+    elif not follower.sways:
+        note(expected)
     return [
         "COLA2 pilot parameters:",
         f"  section/delta {own.delta_m:.1f} m (default {default.delta_m:g})",

@@ -89,6 +89,7 @@ from missions.plan.planner import area_bathymetry
 from missions.route.energy import (
     flies_everywhere,
     flight_conditions,
+    has_sway,
     plan_as_flown,
     sound_vehicle,
 )
@@ -135,6 +136,11 @@ class FlightSettings:
     """Depth of the sea floor."""
     plan: PlanConfig
     """Limit of turns, and the altitude."""
+
+    def __post_init__(self) -> None:
+        if not has_sway(sound_vehicle(self.vehicle)):
+            los = self.vehicle.model_copy(update={"controller": "los"})
+            object.__setattr__(self, "vehicle", los)
 
 
 def flight_settings(config: SurveyConfig) -> FlightSettings:
@@ -615,8 +621,8 @@ def simulate_mission(
     known, vehicle = mission_of_settings(plan, settings), settings.vehicle
     flown_by = pilot_mission(known, vehicle, _mount(settings.camera))
     # Our own pilot holds places by sway where a vehicle has it, which the laws may ask for.
-    has_sway = sways(gains_for(sound_vehicle(vehicle), plan.speed_mps))
-    own = vehicle.model_copy(update={"controller": "sway" if has_sway else "los"})
+    has_sideways = sways(gains_for(sound_vehicle(vehicle), plan.speed_mps))
+    own = vehicle.model_copy(update={"controller": "sway" if has_sideways else "los"})
     own_settings, pictures = replace(settings, vehicle=own), partial(picture_times, known)
     return _simulate(known.plan, own_settings, floor, rng, label, flown_by, pictures)
 

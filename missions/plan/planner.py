@@ -402,5 +402,6 @@ def _warn_of_spacing(plan: PlanConfig, imaging: ImagingSettings, stereo: Swath) 
     elif reached < plan.side_overlap - 1e-9:
         warn(
             f"lines {spacing_m:g} m apart overlap by {reached:.1%}, less than the "
-            f"{plan.side_overlap:.1%} requested, which needs {needed_m:.3f} m"
+            f"{plan.side_overlap:.1%} requested, which needs {needed_m:.3f} m: leave out "
+            "plan.line_spacing_m, and altitudes keep the overlap"
         )

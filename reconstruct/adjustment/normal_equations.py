@@ -347,22 +347,13 @@ def _point_inverse(starts: Indices, by_point: Array) -> Array:
 
 
 @compiled
-def _longest(starts: Indices) -> int:
-    """Most observations that a point has."""
-    longest = np.int64(0)
-    for p in range(starts.shape[0] - 1):
-        longest = max(longest, starts[p + 1] - starts[p])
-    return int(longest)
-
-
-@compiled
 def _reduce(
     starts: Indices, station: Indices, by_point: Array, arm: Array, rest: Array, inverse: Array,
     pointers: Indices, columns: Indices, blocks: Array, border: Array, shared: Array,
 ) -> None:  # fmt: skip
     """Add what some points say, in place, of `shared` below its diagonal."""
     points, count = starts.shape[0] - 1, rest.shape[2]
-    longest = _longest(starts)
+    longest = np.max(np.diff(starts)) if points else 0
     pose = np.empty((longest, 2, 6))
     cross, gain = np.empty((longest, 6, 3)), np.empty((longest, 6, 3))
     together, solved = np.empty((3, count)), np.empty((3, count))
@@ -461,7 +452,7 @@ def _point_covariances(
 ) -> Array:  # fmt: skip
     points = starts.shape[0] - 1
     found = inverse.copy()
-    longest = _longest(starts)
+    longest = np.max(np.diff(starts)) if points else 0
     follow, pose = np.empty((longest, 3, 6)), np.empty((2, 6))
     for p in range(points):
         first, end = starts[p], starts[p + 1]

@@ -1,22 +1,30 @@
 import json
 import math
+import re
 from collections import Counter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 from alice_survey.app.stages import spec
 from alice_survey.core.artefacts import read_stage
-from alice_survey.core.config import SurveyConfig, parse_config
+from alice_survey.core.config import SurveyConfig, VehicleConfig, parse_config
 from alice_survey.core.errors import PlanError, keep_warnings
 from alice_survey.core.executor import SERIAL
+from alice_survey.core.frames import Array
+from alice_survey.sim.vehicle.dynamics import add_damping
+from alice_survey.sim.vehicle.pilot.gains import INTEGRAL, LAG, PLACE, RATE, SWAY, gains_for
 from camera_calib.rig import design_rig
 from missions.coverage.certificate import certificate
 from missions.coverage.stations import stations_of_plan
 from missions.exports.geometry import footprint_outline, footprints_ne
+from missions.fly.simulation import flight_settings
 from missions.plan.planner import plan_survey
+from missions.plan.strength import swell_offset_m
+from missions.route.energy import planned_vehicle
 from missions.values.footprint import common_swath
 from missions.values.pattern import pattern
 from missions.values.plan_file import Plan, read_plan
@@ -237,9 +245,50 @@ def test_a_broken_plan_file_is_an_error_in_one_line(workspace: Path, tmp_path: P
         read_plan(path)
 
 
-def test_swell_is_judged_as_the_current_is(capsys: pytest.CaptureFixture[str]) -> None:
-    for height_m, warned in ((0.5, False), (2.5, True)):
-        planned(area=SMALL["area"], sea={"swell_m": height_m, "swell_period_s": 8.0})
-        assert (
-            "swell of 2.5 m every 8 s moves the water by up to" in capsys.readouterr().err
-        ) is warned
+@pytest.mark.parametrize(("vehicle", "speed_mps"), [("alice", 0.2), ("bluerov2_heavy", 0.2)])
+@pytest.mark.parametrize(("swell_mps", "period_s"), [(0.17, 8.0), (0.33, 8.0), (0.2, 12.0)])
+def test_swell_moves_a_vehicle_as_its_sway_loop_lets_it(
+    vehicle: str, speed_mps: float, swell_mps: float, period_s: float
+) -> None:
+    gains = gains_for(planned_vehicle(VehicleConfig(name=vehicle)), speed_mps)
+    row, body = gains.axes[SWAY], gains.body
+
+    def rate(time_s: float, state: Array) -> list[float]:
+        """Integral of the place, place, speed over ground, force per mass."""
+        total, place, speed, push = state
+        phase = 2 * math.pi * time_s / period_s
+        water, change = swell_mps * math.cos(phase), -2 * math.pi / period_s * swell_mps
+        nu, drag = np.array([speed_mps, speed - water, 0.0, 0.0, 0.0, 0.0]), np.zeros(6)
+        add_damping(body, nu, drag)
+        asked = -row[INTEGRAL] * total - row[PLACE] * place - row[RATE] * speed
+        slowed = change * math.sin(phase) + drag[1] / body.mass[1, 1] + push
+        return [place, speed, slowed, (asked - push) / row[LAG]]
+
+    swung = solve_ivp(rate, (0.0, 12 * period_s), np.zeros(4), max_step=0.05)
+    last = swung.y[1, swung.t > 10 * period_s]
+    found = swell_offset_m(gains, speed_mps, swell_mps, period_s)
+    assert found == pytest.approx(float(np.ptp(last)) / 2, rel=0.05)
+
+
+def test_swell_carries_a_vehicle_without_sway_as_far_as_the_water_goes() -> None:
+    gains = gains_for(planned_vehicle(VehicleConfig(name="sparus2")), 0.5)
+    found = swell_offset_m(gains, 0.5, 0.3, 8.0)
+    assert found == pytest.approx(0.3 * 8.0 / (2 * math.pi), rel=1e-6)
+
+
+def test_plan_warns_of_swell_across_its_lines(capsys: pytest.CaptureFixture[str]) -> None:
+    found = []
+    for height_m, towards_deg in ((0.5, 0.0), (1.2, 0.0), (1.2, 90.0), (2.5, 0.0)):
+        sea = {"swell_m": height_m, "swell_period_s": 8.0, "swell_towards_deg": towards_deg}
+        planned(area=SMALL["area"], sea=sea, plan={"line_heading_deg": 90.0, "cross_lines": 0})
+        off = re.search(r"some (\d+) of (\d+) pictures", capsys.readouterr().err)
+        found.append(int(off[1]) / int(off[2]) if off else 0.0)
+    assert found[0] == found[2] == 0.0
+    # Of a sine of amplitude A the share 2 / pi arccos(a / A) is beyond a.
+    assert 0.1 < found[1] < 0.4 < found[3] < 1.0
+
+
+def test_a_vehicle_without_sway_is_steered_by_los_unasked() -> None:
+    for name, controller in (("alice", "sway"), ("sparus2", "los"), ("remus100", "los")):
+        config = SurveyConfig(vehicle=VehicleConfig(name=name))
+        assert flight_settings(config).vehicle.controller == controller

@@ -42,6 +42,7 @@ def test_straights_are_inside_as_shapely_finds(area: MultiPolygon, seed: int) ->
     # Whatever lies in the area is free, and nothing is that leaves it by more than is allowed.
     certainly = shapely.covers(area, straights)
     perhaps = shapely.covers(area.buffer(1.01 * TOUCH_M, join_style="mitre"), straights)
+    np.testing.assert_array_equal(free, shapely.covers(ways._water, straights))
     assert not np.any(certainly & ~free)
     assert not np.any(free & ~perhaps)
     np.testing.assert_array_equal(ways.free_many(ends, starts), free)
