@@ -9,17 +9,8 @@ import numpy as np
 
 from alice_survey.core.config import PlanConfig, SeaConfig, SurveyConfig
 from alice_survey.core.errors import PlanError, warn
-from alice_survey.sim.vehicle.pilot.gains import (
-    INTEGRAL,
-    LAG,
-    PLACE,
-    RATE,
-    STEADY_SHARE,
-    SWAY,
-    Gains,
-    gains_for,
-    linear_damping,
-)
+from alice_survey.sim.vehicle.pilot import gains as g
+from alice_survey.sim.vehicle.pilot.gains import STEADY_SHARE, Gains
 from alice_survey.sim.vehicle.sea import orbital_speed_mps
 from alice_survey.sim.vehicle.steady import fin_flight, min_speed_mps, too_slow
 from alice_survey.sim.vehicle.vehicle import Vehicle
@@ -147,7 +138,7 @@ def warn_of_swell(flown: energy.FlightConditions, sea: SeaConfig, plan: Plan) ->
     crests = [flown.current_ne_mps + sign * swell_mps * way for sign in (1.0, -1.0)]
     is_held = all(energy.flies_everywhere(replace(flown, current_ne_mps=crest)) for crest in crests)
     across = np.abs(np.sin([line.heading_rad - towards for line in plan.lines]))
-    gains = gains_for(flown.vehicle, flown.speed_mps)
+    gains = g.gains_for(flown.vehicle, flown.speed_mps)
     shares, of = np.unique(np.round(across, 6), return_inverse=True)
     offsets_m = np.array(
         [swell_offset_m(gains, flown.speed_mps, share * swell_mps, period_s) for share in shares]
@@ -180,12 +171,12 @@ def swell_offset_m(gains: Gains, speed_mps: float, swell_mps: float, period_s: f
         swell_mps: amplitude of the water's speed across the line.
         period_s: of the waves.
     """
-    body, row, s = gains.body, gains.axes[SWAY], 2j * math.pi / period_s
-    loop = (row[RATE] * s + row[PLACE] + row[INTEGRAL] / s) / (1.0 + row[LAG] * s)
+    body, row, s = gains.body, gains.axes[g.SWAY], 2j * math.pi / period_s
+    loop = (row[g.RATE] * s + row[g.PLACE] + row[g.INTEGRAL] / s) / (1.0 + row[g.LAG] * s)
     relative_mps, offset_s = swell_mps, 0.0 + 0.0j
     for _ in range(_DRAG_PASSES):
         nu = np.array([speed_mps, 4.0 / (3.0 * math.pi) * relative_mps, 0.0, 0.0, 0.0, 0.0])
-        decay = linear_damping(body, nu)[1, 1] / body.mass[1, 1]
+        decay = g.linear_damping(body, nu)[1, 1] / body.mass[1, 1]
         offset_s = (s + decay) / (s * s + decay * s + loop)
         relative_mps = (relative_mps + abs(1.0 - s * offset_s) * swell_mps) / 2.0
     return abs(offset_s) * swell_mps

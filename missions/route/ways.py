@@ -60,7 +60,7 @@ class _Visibility(NamedTuple):
 
     def of(self, rows: slice) -> "_Visibility":
         """Some rows."""
-        return _Visibility(*(column[rows] for column in self))
+        return _Visibility(self.places[rows], self.corners[rows], self.lengths_m[rows])
 
 
 class Ways:
@@ -94,7 +94,8 @@ class Ways:
             return self.inside(starts_ne) & self.inside(ends_ne)
         _, edges, boxes = self._edges
         met = _crossings(starts_ne, ends_ne, edges, boxes)
-        free, unsure = met == _NONE, met == _UNSURE
+        unsure = met == _UNSURE
+        free: NDArray[np.bool_] = met == _NONE
         free[free] = self.inside(starts_ne[free])
         straights = shapely.linestrings(np.stack([starts_ne[unsure], ends_ne[unsure]], axis=1))
         free[unsure] = shapely.covers(self._water, straights)
