@@ -18,7 +18,8 @@ from alice_survey.core.errors import warn
 from missions.lines.lay import LineTask, check_size, lay_lines
 from missions.lines.sweep import Sweep, best_heading
 from missions.route.dives import split_dives
-from missions.route.turns import Manoeuvre
+from missions.route.terrain import Reach
+from missions.route.turns import Manoeuvre, zones_of
 from missions.route.ways import TOUCH_M, Ways
 from missions.values.area import Area, multipolygon
 from missions.values.costs import Costs
@@ -49,6 +50,7 @@ def plan_parts(
     *,
     usable_wh: float,
     depth_m: float,
+    reach: Reach | None = None,
 ) -> PlannedDives:
     """Lay the lines of all parts and divide them into dives.
 
@@ -61,6 +63,7 @@ def plan_parts(
             of the part before.
         usable_wh: of the battery.
         depth_m: that the vehicle goes down to.
+        reach: of the hull that keeps clear of no-go zones between lines.
 
     Raises:
         PlanError: a part cannot be planned.
@@ -69,7 +72,7 @@ def plan_parts(
     parts = parts_of(area, home_ne)
     whole, tied = PlannedDives(lines=(), dives=(), sweep=None), True
     for number, (part, home) in enumerate(parts):
-        more = _plan_part(part, settings, pattern, costs, home, usable_wh, depth_m)
+        more = _plan_part(part, settings, pattern, costs, home, usable_wh, depth_m, reach)
         dives = (_from_line(dive, len(whole.lines)) for dive in more.dives)
         tied = tied and all(
             after.first_line == before.last_line + 1 and more.lines[after.first_line].kind == "tie"
@@ -136,6 +139,7 @@ def _plan_part(
     home_ne: Place,
     usable_wh: float,
     depth_m: float,
+    reach: Reach | None,
 ) -> PlannedDives:
     """Lines and dives of one part; arguments as of `plan_parts`."""
     ways, sweep = Ways(area.allowed), None
@@ -152,9 +156,10 @@ def _plan_part(
         sweep = best_heading(task)
     heading = math.radians(settings.line_heading_deg or 0.0) if sweep is None else sweep.heading_rad
     lines = lay_lines(task, heading)
+    zones = zones_of(area, reach)
     dives = split_dives(
         lines,
-        Manoeuvre(costs, settings.arc_radius_m, settings.run_in_m, settings.turns, ways),
+        Manoeuvre(costs, settings.arc_radius_m, settings.run_in_m, settings.turns, ways, zones),
         home_ne=home_ne,
         usable_wh=usable_wh,
         max_s=math.inf if settings.dive_s is None else settings.dive_s,

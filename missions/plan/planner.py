@@ -17,7 +17,7 @@ from shapely.geometry import Point
 from alice_survey.core.config import AreaConfig, CameraConfig, PlanConfig, SurveyConfig
 from alice_survey.core.errors import PlanError, keep_warnings, warn
 from alice_survey.sim.vehicle.pilot.settings import turn_in_place_rate_rad_s
-from alice_survey.sim.vehicle.vehicle import POINT, Hull
+from alice_survey.sim.vehicle.vehicle import POINT, Vehicle
 from camera_calib.rig import Rig
 from missions.areas.bathymetry import Bathymetry, mean_depth_m, read_bathymetry
 from missions.areas.survey import survey_area
@@ -31,12 +31,13 @@ from missions.plan.parts import plan_parts
 from missions.plan.rows import Setting, imaging_rows
 from missions.plan.strength import check_no_stops, check_turns, survey_costs, warn_of_swell
 from missions.route import energy, terrain
+from missions.route.turns import hops_over, zones_of
 from missions.values.area import Area
 from missions.values.costs import Costs
 from missions.values.footprint import Swath, common_swath
 from missions.values.line import Line
 from missions.values.pattern import Pattern
-from missions.values.plan_file import Plan
+from missions.values.plan_file import Dive, Plan
 
 ByStation = tuple[tuple[float, ...], ...]
 """A value at each station of each line."""
@@ -94,7 +95,7 @@ def plan_survey(config: SurveyConfig, rig: Rig, *, max_cells: int | None = None)
         _warn_of_spacing(plan, imaging, stereo)
         vehicle, glass_body_m = energy.sound_vehicle(config.vehicle), config.camera.position_body_m
         hull, clearance_m = vehicle.hull, config.area.no_go_clearance_m
-        _warn_of_hull(vehicle.name, area, clearance_m, hull, glass_body_m)
+        hull_reach = terrain.reach_of(hull, glass_body_m, 0.0, 0.0)
         home = _home(plan.home_ne_m, area)
         costs = survey_costs(config, imaging_w=imaging.imaging_w)
         flown = plan_parts(
@@ -105,9 +106,11 @@ def plan_survey(config: SurveyConfig, rig: Rig, *, max_cells: int | None = None)
             home,
             usable_wh=energy.usable_wh(config.vehicle),
             depth_m=below_m,
+            reach=hull_reach,
         )
         lines, dives, sweep = flown.lines, flown.dives, flown.sweep
         check_no_stops(vehicle, plan, dives)
+        _warn_of_hull(vehicle, area, clearance_m, hull_reach, dives)
         reach = terrain.reach_of(
             hull,
             glass_body_m,
@@ -369,18 +372,19 @@ def _stations(plan: Plan, bathymetry: Bathymetry | None) -> Stations:
 
 
 def _warn_of_hull(
-    name: str, area: Area, clearance_m: float, hull: Hull, glass_body_m: tuple[float, float, float]
+    vehicle: Vehicle, area: Area, clearance_m: float, reach: terrain.Reach, dives: Sequence[Dive]
 ) -> None:
     """The allowed area holds the camera: the hull behind it reaches farther."""
-    if hull == POINT:
-        warn(f"{name} has no [hull]: distances to floor and zones are those of one point")
-    forward_m, right_m, _ = glass_body_m
-    behind_m = math.hypot(hull.tail_m + forward_m, hull.half_breadth_m + abs(right_m))
-    if not area.no_go.is_empty and clearance_m < behind_m:
+    if vehicle.hull == POINT:
+        warn(f"{vehicle.name} has no [hull]: distances to floor and zones are those of one point")
+    behind_m, zones = math.hypot(reach.astern_m, reach.aside_m), zones_of(area, reach)
+    if zones is not None and clearance_m < behind_m:
+        touching, ways = hops_over(zones, dives)
         warn(
-            f"the camera is kept {clearance_m:g} m off the no-go zones, the hull "
-            f"reaches {behind_m:.1f} m from it and navigation errs on top: raise "
-            "area.no_go_clearance_m unless the zones have room around what they keep off"
+            f"lines keep the camera {clearance_m:g} m off the no-go zones, the hull reaches "
+            f"{behind_m:.1f} m from it; for want of room it touches them on {touching} of {ways} "
+            "ways between lines, too: raise area.no_go_clearance_m unless the zones have room "
+            "around what they keep off"
         )
 
 

@@ -4,7 +4,7 @@ Keys and versions: QGroundControl's developer guide, "Plan File Format".
 """
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +14,10 @@ from shapely.geometry import Polygon
 
 from alice_survey.core.artefacts import write_json
 from alice_survey.core.errors import warn
+from missions.areas.survey import without_slivers
 from missions.exports import mavlink
 from missions.exports.format import Export, ExportFile, ExportFormat
-from missions.exports.geometry import CameraMount, lat_lon
-from missions.exports.waypoints import Waypoint
+from missions.exports.geometry import lat_lon
 from missions.values.area import multipolygon
 from missions.values.mission import Mission
 from missions.values.plan_file import Plan
@@ -49,7 +49,7 @@ def write_qgc(path: Path, export: Export, dive: int) -> None:
         "geoFence": {
             "version": 2,
             "circles": [],
-            "polygons": _fence(plan, export.dives[dive], mount),
+            "polygons": _fence(export, first=dive == 0),
         },
         "rallyPoints": {"version": 2, "points": []},
         "aliceSurvey": {"name": plan.name, "about": mount.about},
@@ -75,33 +75,36 @@ def _simple(item: mavlink.Item, number: int) -> dict[str, Any]:
     return data
 
 
-def _fence(plan: Plan, points: Sequence[Waypoint], mount: CameraMount) -> list[dict[str, Any]]:
+def _fence(export: Export, *, first: bool) -> list[dict[str, Any]]:
     """The areas of the glass as those of the vehicle's reference point, a lever arm away.
 
-    The allowed area grows by the lever arm. A zone to keep out of stays as it is, unless the
-    reference point has to cut its corner to bring the glass along its edge: then it shrinks by the
-    lever arm, which the reference point surely keeps out of.
+    The allowed area grows by the lever arm. A zone to keep out of stays as it is, but for where the
+    reference point has to pass so that the glass flies its lines, with the tolerance to each side.
     """
-    grown = plan.area.allowed.buffer(mount.reach_m, join_style="mitre")
-    outer = [Polygon(part.exterior) for part in multipolygon(grown).geoms]
-    zones: list[Polygon] = []
-    holes = [Polygon(hole) for part in plan.area.allowed.geoms for hole in part.interiors]
-    for zone in (*holes, *plan.area.no_go.geoms):
-        # A hole of the allowed area is most often a no-go zone: say it once.
-        if not any(other.buffer(1e-3).contains(zone) for other in zones):
-            zones.append(Polygon(zone.exterior))
-    track = shapely.LineString([point.vehicle_ne_m for point in points])
-    fences = [_polygon(plan, part, inclusion=True) for part in outer]
+    plan, area = export.plan, export.plan.area
+    grown = area.allowed.buffer(export.mount.reach_m, join_style="mitre")
+    fences = [_polygon(plan, part, inclusion=True) for part in multipolygon(grown).geoms]
+    # A hole of the allowed area is most often a no-go zone: say it once.
+    said = area.no_go.buffer(1e-3)
+    holes = [Polygon(hole) for part in area.allowed.geoms for hole in part.interiors]
+    zones = [*(hole for hole in holes if not said.contains(hole)), *area.no_go.geoms]
+    tracks = [[point.vehicle_ne_m for point in points] for points in export.dives]
+    passed = shapely.MultiLineString(tracks).buffer(export.tolerance_m)
+    crossed = lost = 0
     for zone in zones:
         parts = [zone]
-        if zone.intersects(track):
-            parts = list(multipolygon(zone.buffer(-mount.reach_m, join_style="mitre")).geoms)
-            if not parts:
-                warn(
-                    f"a no-go zone of {zone.area:.2f} m2 is left out of the fence: the vehicle's "
-                    f"reference point, {mount.reach_m:.2f} m from the glass, crosses it in a turn"
-                )
+        if zone.intersects(passed):
+            crossed += 1
+            left = without_slivers(multipolygon(zone.difference(passed)))
+            parts = [part for part in left.geoms if len(part.interiors) <= len(zone.interiors)]
+            lost += not parts
         fences += [_polygon(plan, part, inclusion=False) for part in parts]
+    if crossed and first:
+        warn(
+            f"lines bring the vehicle's reference point, {export.mount.reach_m:.2f} m from the "
+            f"glass, over {crossed} of {len(zones)} no-go zones: the fence leaves it the way, and "
+            f"leaves out {lost} of them; raise area.no_go_clearance_m to keep all"
+        )
     return fences
 
 

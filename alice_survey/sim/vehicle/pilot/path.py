@@ -86,8 +86,8 @@ def path_from_legs(
         altitude_m: target above the sea floor, of the followed point.
         speed_mps: target over ground.
         turn_rad: (L,) of turns on the spot, else 0; there are none if left out.
-        side_rad: (L,) heading minus course, +-pi/2 of sway steps, else 0; there are none if left
-            out.
+        side_rad: (L,) heading minus course, +-pi/2 of sway steps, +-pi astern, else 0; there are
+            none if left out.
         profile: as `Path.profile_at_m` and `Path.profile_m`.
 
     Raises:
@@ -113,13 +113,13 @@ def path_from_legs(
             f"the path's altitude ({altitude_m:g} m) and speed ({speed_mps:g} m/s) must be positive"
         )
     pivots, aside, bent = turns != 0, side != 0, curvature != 0
-    square = np.abs(np.abs(side) - math.pi / 2) <= _KINK_RAD
+    square = np.abs(np.abs(np.abs(side) - 0.75 * math.pi) - 0.25 * math.pi) <= _KINK_RAD
     bad = np.where(pivots, (length != 0) | bent | aside, (length <= 0) | (aside & (bent | ~square)))
     for i in np.flatnonzero(bad).tolist():
         raise VehicleError(
             f"leg {i} of the path is {length[i]:g} m long, curvature {curvature[i]:g}, turns "
             f"{math.degrees(turns[i]):.1f} deg on the spot and heads {math.degrees(side[i]):.1f} "
-            "deg off its course: it must go ahead, turn without length, or step straight aside"
+            "deg off its course: it must go ahead, turn without length, or step aside or astern"
         )
     for i in range(1, len(start)):
         before = i - 1
