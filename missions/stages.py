@@ -65,8 +65,12 @@ def _fly_shortfall(folder: Path) -> str:
     outside, allowed_m = flight.outside_allowed, flight.allowed_cross_track_m
     if outside is None or allowed_m is None:  # of a version that did not look
         return ""
-    if outside.worst_m > allowed_m:
-        return f"{flight.vehicle} left the allowed area by {outside.worst_m:.2f} m"
+    outside_m = allowed_m if outside.allowed_m is None else outside.allowed_m
+    if outside.worst_m > outside_m:
+        return (
+            f"{flight.vehicle} left the allowed area by {outside.worst_m:.2f} m, more than the "
+            f"{outside_m:.2f} m that were to be expected"
+        )
     planned = flight.stations_planned
     missed = max(planned - flight.stations, 0) + flight.stations_off_line
     if missed > _MAX_MISSED_SHARE * planned:

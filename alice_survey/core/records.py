@@ -82,6 +82,8 @@ class OutsideAllowed(JsonRecord):
 
     share_of_time: float
     worst_m: float
+    allowed_m: float | None = None
+    """As far as a picture may be off its line, and what an autopilot's law is expected to add."""
 
 
 class FlightRecord(JsonRecord):

@@ -9,7 +9,11 @@ to its track by sway with an integral: no steady current holds it off that the v
 import math
 from dataclasses import dataclass
 
+import numpy as np
+import shapely
+
 from alice_survey.core.config import SeaConfig, VehicleConfig
+from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.pilot.gains import FASTEST, SWAY, Gains, gains_for
 from alice_survey.sim.vehicle.pilot.mission import (
     Cola2Settings,
@@ -20,6 +24,8 @@ from alice_survey.sim.vehicle.pilot.mission import (
 )
 from alice_survey.sim.vehicle.pilot.settings import min_look_ahead_m
 from missions.route.energy import planned_vehicle
+from missions.values.mission import Mission
+from missions.values.plan_file import Plan
 
 COLA2_TOLERANCE_Z_M = 0.3
 """A step down is done this near to its depth; COLA2's own 1 m begins a line a metre too high."""
@@ -42,6 +48,8 @@ class Follower:
     """Yaw rate at a heading error of one radian."""
     current_ne_mps: tuple[float, float]
     """The expected current, towards north and east."""
+    gust_mps: float = 0.0
+    """What its slow changes add: two sigmas."""
 
     def across_mps(self, heading_rad: float) -> float:
         """Current across a course, positive to starboard."""
@@ -79,6 +87,7 @@ def follower_of(vehicle: VehicleConfig, sea: SeaConfig, speed_mps: float) -> Fol
             sea.current_mps * math.cos(towards),
             sea.current_mps * math.sin(towards),
         ),
+        gust_mps=2.0 * sea.current_sigma_mps,
     )
 
 
@@ -120,6 +129,40 @@ def end_tolerance_m(follower: Follower) -> float:
     vehicle follows at a heading error of a radian at most.
     """
     return follower.circle_m + follower.current_mps / follower.turn_rad_s
+
+
+def swing_ne_m(follower: Follower, way_ne: Array, lever_m: float) -> Array:
+    """How far beyond the ends of steps COLA2 brings the glass while it turns, (2,) or (N, 2).
+
+    A step is done the circle's radius before its end; the glass is ahead of the reference point,
+    goes on as the vehicle turns, and the current carries it: across the hull, on average of half a
+    turn for half its time.
+
+    Args:
+        follower: vehicle and current.
+        way_ne: (2,) or (N, 2) directions in which it comes to the ends.
+        lever_m: how far the glass is ahead of the reference point.
+    """
+    ahead_m = max(lever_m + follower.turn_in_m - follower.circle_m, 0.0)
+    carried_s = 0.5 * math.pi / follower.turn_rad_s
+    return ahead_m * way_ne + carried_s * np.array(follower.current_ne_mps)
+
+
+def expected_off_m(follower: Follower, plan: Plan, lever_m: float, tolerance_m: float) -> Array:
+    """How far off each line, (L,), COLA2 brings the glass: where it begins, and in a current."""
+    across = np.array([abs(follower.across_mps(line.heading_rad)) for line in plan.lines])
+    drifts = [steady_drift(mps + follower.gust_mps, plan.speed_mps) for mps in across.tolist()]
+    off_m: Array = tolerance_m + (follower.delta_m - lever_m) * np.array(drifts)
+    return off_m
+
+
+def expected_outside_m(follower: Follower, plan: Plan, lever_m: float, mission: Mission) -> float:
+    """How far out of the allowed area COLA2 brings the glass at the ends of a mission's steps."""
+    ends = mission.ends_ne(plan.datum)
+    ways = np.diff(ends, axis=0, prepend=ends[:1])
+    ways /= np.maximum(np.hypot(*ways.T), 1e-9)[:, None]
+    places = shapely.points(ends + swing_ne_m(follower, ways, lever_m))
+    return float(np.max(shapely.distance(plan.area.allowed, places)))
 
 
 def cola2_settings(delta_m: float, speed_mps: float) -> Cola2Settings:

@@ -14,7 +14,12 @@ from alice_survey.core.run import progress
 from alice_survey.kit.words import count
 from alice_survey.sim.vehicle.pilot.mission import MIN_RADIUS_M, MIN_SPEED_MPS, Cola2Settings
 from camera_calib.rig import Rig, design_rig
-from missions.exports.follower import cola2_settings, line_offset_m
+from missions.exports.follower import (
+    cola2_settings,
+    expected_off_m,
+    expected_outside_m,
+    line_offset_m,
+)
 from missions.exports.format import Export, ExportFormat, Options, line_tolerance_m, options_of
 from missions.exports.registry import format_named, format_names
 from missions.values.plan_file import Plan, read_plan
@@ -67,7 +72,7 @@ def write_exports(
     about = folder / "about.txt"
     files[about] = "what the files hold, and how"
     files[folder / SUMS] = "digests of the others, for sha256sum --check"
-    notes = _cola2(export, chosen=formats is not None) if "cola2" in names else []
+    notes = _cola2(export, files, chosen=formats is not None) if "cola2" in names else []
     notes += _ardusub(export) if {"wpl", "qgc"} & set(names) else []
     if plan.is_flown_by_depth and not refusal:
         notes.append(
@@ -237,7 +242,7 @@ def _config_of_plan(path: Path) -> SurveyConfig:
     return parse_config(known, str(path.parent))
 
 
-def _cola2(export: Export, *, chosen: bool) -> list[str]:
+def _cola2(export: Export, files: Iterable[Path], *, chosen: bool) -> list[str]:
     """Parameters to set, and what is to be expected in the current.
 
     Warns where COLA2 cannot hold the plan's lines in it, if formats were chosen or the vehicle has
@@ -248,6 +253,7 @@ def _cola2(export: Export, *, chosen: bool) -> list[str]:
         return []
     if not math.isfinite(follower.delta_m):
         return [f"COLA2: no section/delta keeps {follower.name} from weaving: lower the speed."]
+    read = format_named("cola2").read
     own, default = cola2_settings(follower.delta_m, plan.speed_mps), Cola2Settings()
     lever_m, allowed_m = export.mount.glass_body_m[0], plan.allowed_offset_m
     offsets = [
@@ -256,6 +262,10 @@ def _cola2(export: Export, *, chosen: bool) -> list[str]:
         if line.kind in ("survey", "fill")
     ]
     offset_m = max(offsets, default=0.0)
+    missions = [read(path.read_text("utf-8")) for path in files if read and path.suffix == ".xml"]
+    places = (expected_outside_m(follower, plan, lever_m, m) for m in missions if m)
+    outside_m = max(places, default=0.0)
+    off_m = expected_off_m(follower, plan, lever_m, export.cola2_tolerance_m)
     expected = (
         f"in the expected current of {follower.current_mps:g} m/s COLA2 holds {follower.name} up "
         f"to {offset_m:.2f} m off lines {plan.line_spacing_m:.2f} m apart, which allow "
@@ -278,6 +288,8 @@ def _cola2(export: Export, *, chosen: bool) -> list[str]:
         f"  section/min_surge_velocity {own.min_surge_mps:g} m/s",
         f"  section/max_surge_velocity {own.max_surge_mps:g} m/s",
         f"{expected[0].upper()}{expected[1:]}.",
+        f"With gusts, and where lines begin, up to {off_m.max():.2f} m; in turns it leaves the "
+        f"allowed area by up to {outside_m:.2f} m: area.turn_margin_m gives it more room.",
     ]
 
 

@@ -124,7 +124,7 @@ def _check_pictures(flight: Flight) -> None:
     if flight.stations_off_line:
         warn(
             f"{flight.stations_off_line} of {len(flight.trigger_s)} pictures were taken more than "
-            f"{flight.plan.allowed_offset_m:.2f} m off their lines, where neighbouring lines may "
+            f"{flight.allowed_off_m.max():.2f} m off their lines, where neighbouring lines may "
             "leave gaps: choose more side_overlap, less current or another controller"
         )
 
@@ -341,11 +341,12 @@ def flight_summary(flight: Flight, vehicle: VehicleConfig, rig: Rig) -> dict[str
         "stations_planned": stations_of_dives(plan),
         "dives": len(plan.dives),
         "stations_off_line": flight.stations_off_line,
-        "allowed_cross_track_m": flight.plan.allowed_offset_m,
+        "allowed_cross_track_m": float(flight.allowed_off_m.max()),
         "min_clearance_m": flight.clearance_m,
         "outside_allowed": {
             "share_of_time": float(np.mean(flight.outside_m > 0.0)),
             "worst_m": float(flight.outside_m.max()),
+            "allowed_m": plan.allowed_offset_m + flight.expected_outside_m,
         },
         "on_lines": {
             "share_of_time": float(on_line.mean()),

@@ -45,6 +45,10 @@ class Flight:
     flown: Flown
     ending: str
     """Why the flight ended, in words."""
+    expected_off_m: Array | float = 0.0
+    """(L,) how far off the plan's lines the law of an autopilot is expected to bring the glass."""
+    expected_outside_m: float = 0.0
+    """How far out of the allowed area."""
 
     @cached_property
     def attitude_rad(self) -> Array:
@@ -87,6 +91,12 @@ class Flight:
         across = off[:, 1] * np.cos(heading) - off[:, 0] * np.sin(heading)
         return self.believed_route_error + across
 
+    @property
+    def allowed_off_m(self) -> Array:
+        """(L,) how far off each of the plan's lines its pictures may be."""
+        neighbours_meet_m = np.full(len(self.plan.lines), self.plan.allowed_offset_m)
+        return np.maximum(neighbours_meet_m, self.expected_off_m)
+
     @cached_property
     def stations_off_line(self) -> int:
         """How many pictures were truly taken farther off their line than is allowed."""
@@ -97,7 +107,7 @@ class Flight:
             self.plan.lines[index].offsets_m(place)[1]
             for place, index in zip(places, self.trigger_line, strict=True)
         ]
-        return int(np.sum(np.abs(off) > self.plan.allowed_offset_m))
+        return int(np.sum(np.abs(off) > self.allowed_off_m[list(self.trigger_line)]))
 
     @cached_property
     def outside_m(self) -> Array:

@@ -26,6 +26,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from missions.exports.follower import swing_ne_m
 from missions.exports.format import MIN_TOLERANCE_M, Export, ExportFile, ExportFormat
 from missions.exports.waypoints import MAX_STEP_M, Waypoint, gone_on, move, room_m
 from missions.exports.xml_text import (
@@ -115,8 +116,10 @@ def _set_back(export: Export, point: Waypoint, start: Waypoint) -> Waypoint:
     requested_m = follower.delta_m * math.log(max(export.cola2_tolerance_m / allowed_m, 1.0))
     line = plan.lines[start.line]
     back = -np.array([math.cos(line.heading_rad), math.sin(line.heading_rad)])
-    reach_m = max(requested_m, plan.run_in_m) + follower.circle_m
-    free_m = room_m(plan, np.array(line.start_ne_m), reach_m * back) - follower.circle_m
+    lever_m = export.mount.glass_body_m[0]
+    turn_m = lever_m + max(float(back @ swing_ne_m(follower, back, lever_m)), 0.0)
+    reach_m = max(requested_m, plan.run_in_m) + turn_m
+    free_m = room_m(plan, np.array(line.start_ne_m), reach_m * back) - turn_m
     by_m = free_m - math.dist(point.vehicle_ne_m, start.vehicle_ne_m)
     return move(plan, point, max(by_m, 0.0) * back)
 

@@ -89,7 +89,7 @@ def _fence(export: Export, *, first: bool) -> list[dict[str, Any]]:
     holes = [Polygon(hole) for part in area.allowed.geoms for hole in part.interiors]
     zones = [*(hole for hole in holes if not said.contains(hole)), *area.no_go.geoms]
     tracks = [[point.vehicle_ne_m for point in points] for points in export.dives]
-    passed = shapely.MultiLineString(tracks).buffer(export.tolerance_m)
+    passed = shapely.MultiLineString(tracks).buffer(2.0 * export.tolerance_m)
     crossed = lost = 0
     for zone in zones:
         parts = [zone]
