@@ -18,8 +18,7 @@ from alice_survey.core.errors import warn
 from missions.lines.lay import LineTask, check_size, lay_lines
 from missions.lines.sweep import Sweep, best_heading
 from missions.route.dives import split_dives
-from missions.route.terrain import Reach
-from missions.route.turns import Manoeuvre, zones_of
+from missions.route.turns import Manoeuvre, Zones
 from missions.route.ways import TOUCH_M, Ways
 from missions.values.area import Area, multipolygon
 from missions.values.costs import Costs
@@ -50,7 +49,7 @@ def plan_parts(
     *,
     usable_wh: float,
     depth_m: float,
-    reach: Reach | None = None,
+    zones: Zones | None = None,
 ) -> PlannedDives:
     """Lay the lines of all parts and divide them into dives.
 
@@ -63,7 +62,7 @@ def plan_parts(
             of the part before.
         usable_wh: of the battery.
         depth_m: that the vehicle goes down to.
-        reach: of the hull that keeps clear of no-go zones between lines.
+        zones: that the hull keeps out of between lines.
 
     Raises:
         PlanError: a part cannot be planned.
@@ -72,7 +71,7 @@ def plan_parts(
     parts = parts_of(area, home_ne)
     whole, tied = PlannedDives(lines=(), dives=(), sweep=None), True
     for number, (part, home) in enumerate(parts):
-        more = _plan_part(part, settings, pattern, costs, home, usable_wh, depth_m, reach)
+        more = _plan_part(part, settings, pattern, costs, home, usable_wh, depth_m, zones)
         dives = (_from_line(dive, len(whole.lines)) for dive in more.dives)
         tied = tied and all(
             after.first_line == before.last_line + 1 and more.lines[after.first_line].kind == "tie"
@@ -139,7 +138,7 @@ def _plan_part(
     home_ne: Place,
     usable_wh: float,
     depth_m: float,
-    reach: Reach | None,
+    zones: Zones | None,
 ) -> PlannedDives:
     """Lines and dives of one part; arguments as of `plan_parts`."""
     ways, sweep = Ways(area.allowed), None
@@ -156,7 +155,6 @@ def _plan_part(
         sweep = best_heading(task)
     heading = math.radians(settings.line_heading_deg or 0.0) if sweep is None else sweep.heading_rad
     lines = lay_lines(task, heading)
-    zones = zones_of(area, reach)
     dives = split_dives(
         lines,
         Manoeuvre(costs, settings.arc_radius_m, settings.run_in_m, settings.turns, ways, zones),

@@ -31,7 +31,7 @@ from missions.plan.parts import plan_parts
 from missions.plan.rows import Setting, imaging_rows
 from missions.plan.strength import check_no_stops, check_turns, survey_costs, warn_of_swell
 from missions.route import energy, terrain
-from missions.route.turns import hops_over, zones_of
+from missions.route.turns import Zones
 from missions.values.area import Area
 from missions.values.costs import Costs
 from missions.values.footprint import Swath, common_swath
@@ -95,7 +95,9 @@ def plan_survey(config: SurveyConfig, rig: Rig, *, max_cells: int | None = None)
         _warn_of_spacing(plan, imaging, stereo)
         vehicle, glass_body_m = energy.sound_vehicle(config.vehicle), config.camera.position_body_m
         hull, clearance_m = vehicle.hull, config.area.no_go_clearance_m
-        hull_reach = terrain.reach_of(hull, glass_body_m, 0.0, 0.0)
+        zones = None
+        if not area.no_go.is_empty:
+            zones = Zones(area, terrain.reach_of(hull, glass_body_m, 0.0, 0.0))
         home = _home(plan.home_ne_m, area)
         costs = survey_costs(config, imaging_w=imaging.imaging_w)
         flown = plan_parts(
@@ -106,11 +108,11 @@ def plan_survey(config: SurveyConfig, rig: Rig, *, max_cells: int | None = None)
             home,
             usable_wh=energy.usable_wh(config.vehicle),
             depth_m=below_m,
-            reach=hull_reach,
+            zones=zones,
         )
         lines, dives, sweep = flown.lines, flown.dives, flown.sweep
         check_no_stops(vehicle, plan, dives)
-        _warn_of_hull(vehicle, area, clearance_m, hull_reach, dives)
+        _warn_of_hull(vehicle, zones, clearance_m, dives)
         reach = terrain.reach_of(
             hull,
             glass_body_m,
@@ -372,19 +374,18 @@ def _stations(plan: Plan, bathymetry: Bathymetry | None) -> Stations:
 
 
 def _warn_of_hull(
-    vehicle: Vehicle, area: Area, clearance_m: float, reach: terrain.Reach, dives: Sequence[Dive]
+    vehicle: Vehicle, zones: Zones | None, clearance_m: float, dives: Sequence[Dive]
 ) -> None:
     """The allowed area holds the camera: the hull behind it reaches farther."""
     if vehicle.hull == POINT:
         warn(f"{vehicle.name} has no [hull]: distances to floor and zones are those of one point")
-    behind_m, zones = math.hypot(reach.astern_m, reach.aside_m), zones_of(area, reach)
-    if zones is not None and clearance_m < behind_m:
-        touching, ways = hops_over(zones, dives)
+    if zones is not None and clearance_m < zones.reach_m:
+        touching, ways = zones.touching(dives)
         warn(
             f"lines keep the camera {clearance_m:g} m off the no-go zones, the hull reaches "
-            f"{behind_m:.1f} m from it; for want of room it touches them on {touching} of {ways} "
-            "ways between lines, too: raise area.no_go_clearance_m unless the zones have room "
-            "around what they keep off"
+            f"{zones.reach_m:.1f} m from it; for want of room it touches them on {touching} of "
+            f"{ways} ways between lines, too: raise area.no_go_clearance_m unless the zones have "
+            "room around what they keep off"
         )
 
 

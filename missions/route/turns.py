@@ -15,14 +15,13 @@ the shortest of the six that stays out of it is taken.
 
 import math
 from collections.abc import Sequence
-from functools import cached_property
+from dataclasses import astuple
 from itertools import chain, groupby
 from typing import Literal, NamedTuple
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from shapely.geometry import MultiPolygon
 
 from alice_survey.core.errors import PlanError, warn
 from alice_survey.core.frames import Array
@@ -37,8 +36,8 @@ from missions.values.plan_file import Dive
 Turns = Literal["auto", "arcs", "spot", "sway"]
 
 MAX_SWAY_M = 5.0
-"""Longest step sideways or astern. Chosen: some line spacings; farther the vehicle had better go
-ahead, since its thrusters and its drag are made for correction there, not for transit."""
+"""Longest sway step. Chosen: some line spacings; farther the vehicle had better go ahead, since its
+lateral thrusters and its side's drag are made for correction, not for transit."""
 COLUMNS = 8
 """Columns of a leg: north, east, course, length, curvature, line, turn, side."""
 _NONE, _AHEAD, _ARCS, _IN_PLACE, _SWAY = range(5)
@@ -50,11 +49,10 @@ _FULL = 2 * math.pi
 _TINY = 1e-9
 _SAME_M = 1e-6
 _SWEEP_RAD = math.radians(4.0)
-"""Between headings of a hull that turns: its corners leave straights by 1 mm."""
+"""Between headings of a hull that turns: its corners leave the straights between them by 1 mm."""
 _BACK_STEP_M = 0.05
-_CORNER_M = 0.3
-"""How much farther round zones ways lead where there is room, so as to stop at few corners."""
 _MITRE_LIMIT = 1.1
+"""Room to turn has few corners, where the vehicle stops, and is hardly larger than needed."""
 _DEAR_J = 1e15
 """More than any battery holds: stands for an infinite cost, so that of two such the shorter is
 chosen."""
@@ -63,90 +61,50 @@ chosen."""
 class Zones:
     """No-go zones, and where a hull may turn freely."""
 
-    def __init__(self, no_go: MultiPolygon, allowed: MultiPolygon, reach: Reach) -> None:
-        """Prepare the zones for a hull that reaches so far from the glass."""
-        self._no_go = no_go.buffer(-TOUCH_M, join_style="mitre")
-        self._tree = shapely.STRtree(shapely.get_parts(self._no_go))
+    def __init__(self, area: Area, reach: Reach) -> None:
+        """Prepare the zones of an area for a hull that reaches so far from the glass."""
+        self._no_go = area.no_go.buffer(-TOUCH_M, join_style="mitre")
         shapely.prepare(self._no_go)
-        self._corners = np.array(
-            [(x, y) for x in (reach.ahead_m, -reach.astern_m) for y in (-1, 1)], dtype=np.float64
-        ) * [1.0, reach.aside_m]
-        self._reach_m = float(np.hypot(*self._corners.T).max())
-        self.length_m = reach.ahead_m + reach.astern_m
-        self._allowed = allowed
+        ends = np.array([reach.ahead_m, -reach.astern_m])
+        self._corners = np.concatenate([ends + 1j * reach.aside_m, ends - 1j * reach.aside_m])
+        self.reach_m = float(np.abs(self._corners).max())
+        self.hull_m = reach.ahead_m + reach.astern_m
+        near = area.no_go.buffer(self.reach_m, join_style="mitre", mitre_limit=_MITRE_LIMIT)
+        self.ways = Ways(multipolygon(area.allowed.difference(near)))
+        """Of the glass, with room for the hull at any heading."""
 
-    @cached_property
-    def spaces(self) -> tuple[Ways, Ways]:
-        """The ways of the glass with room for the hull at any heading, first with few corners."""
-        near = self._no_go.buffer(self._reach_m, join_style="mitre", mitre_limit=_MITRE_LIMIT)
-        wide = self._no_go.buffer(self._reach_m + _CORNER_M).simplify(0.99 * _CORNER_M)
-        roomy, tight = (multipolygon(self._allowed.difference(zone)) for zone in (wide, near))
-        return Ways(roomy), Ways(tight)
-
-    def clear_of(self, hops: Sequence[Array] | Array) -> NDArray[np.bool_]:
-        """Whether the hull keeps out on ways, (N,), of some legs each."""
-        of = np.repeat(np.arange(len(hops)), [len(legs) for legs in hops])
-        touched = of[~self.clear(np.concatenate([np.empty((0, COLUMNS)), *hops]))]
-        return ~np.isin(np.arange(len(hops)), touched)
-
-    def clear(self, legs: Array) -> NDArray[np.bool_]:
-        """Whether the hull keeps out along legs, (N,) of (N, 8); also where there is no leg."""
-        clear = np.ones(len(legs), dtype=np.bool_)
-        some = np.flatnonzero((legs[:, 3] > 0.0) | (np.abs(legs[:, 6]) > 0.0))  # none of NaN
-        far_m = self._reach_m + legs[some, 3]
-        boxes = shapely.box(
-            *(legs[some, :2] - far_m[:, None]).T, *(legs[some, :2] + far_m[:, None]).T
-        )
-        some = some[np.unique(self._tree.query(boxes)[0])]
-        turned = legs[some, 6] + legs[some, 4] * legs[some, 3]
-        pieces = np.maximum(np.ceil(np.abs(turned) / _SWEEP_RAD), 1.0).astype(np.int64)
-        of = np.repeat(some, pieces)
+    def clear(self, hops: Sequence[Array] | Array) -> NDArray[np.bool_]:
+        """Whether the hull keeps out on ways, (N,), of some legs (L, 8) each."""
+        legs = np.concatenate([np.empty((0, COLUMNS)), *hops])
+        hop = np.repeat(np.arange(len(hops)), [len(legs) for legs in hops])
+        moves = (legs[:, 3] > 0.0) | (np.abs(legs[:, 6]) > 0.0)  # NaN does not
+        turned = np.abs(legs[moves, 6] + legs[moves, 4] * legs[moves, 3])
+        pieces = np.maximum(np.ceil(turned / _SWEEP_RAD), 1.0).astype(np.int64)
+        of = np.repeat(np.flatnonzero(moves), pieces)
         number = np.arange(len(of)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
-        ends = []
-        for step in (0, 1):
-            share = (number + step) / np.repeat(pieces, pieces)
-            place = ends_of(legs[of, :3], legs[of, 4], share * legs[of, 3])
-            heading = place[:, 2] + share * legs[of, 6] + legs[of, 7]
-            c, s = np.cos(heading)[:, None], np.sin(heading)[:, None]
-            ahead, right = self._corners.T
-            corners = np.stack([c * ahead - s * right, s * ahead + c * right], axis=2)
-            ends.append(place[:, None, :2] + corners)
-        swept = shapely.convex_hull(shapely.multipoints(np.concatenate(ends, axis=1)))
-        clear[of[shapely.intersects(self._no_go, swept)]] = False
-        return clear
+        share = (number[:, None] + np.arange(2)) / np.repeat(pieces, pieces)[:, None]
+        both = legs[np.repeat(of, 2)]
+        poses = ends_of(both[:, :3], both[:, 4], share.ravel() * both[:, 3])
+        turn = np.exp(1j * (poses[:, 2] + share.ravel() * both[:, 6] + both[:, 7]))
+        hull = (poses[:, 0] + 1j * poses[:, 1] + turn * self._corners[:, None]).T
+        corners = np.stack([hull.real, hull.imag], axis=2).reshape(-1, 8, 2)
+        swept = shapely.convex_hull(shapely.multipoints(corners))
+        touching = hop[of[shapely.intersects(self._no_go, swept)]]
+        return ~np.isin(np.arange(len(hops)), touching)
 
+    def touching(self, dives: Sequence[Dive]) -> tuple[int, int]:
+        """On how many ways between lines the hull touches a zone, and of how many.
 
-def zones_of(area: Area, reach: Reach | None) -> Zones | None:
-    """The no-go zones of an area for a hull; None where there are none."""
-    if reach is None or area.no_go.is_empty:
-        return None
-    return Zones(area.no_go, area.allowed, reach)
-
-
-def hops_over(zones: Zones, dives: Sequence[Dive]) -> tuple[int, int]:
-    """On how many ways between lines the hull touches a zone, and of how many.
-
-    What continues a line, ahead or astern, passes as the line does.
-    """
-    hops = []
-    for dive in dives:
-        for on_line, group in groupby(dive.route.legs, lambda leg: leg.line >= 0):
-            legs = list(group)
-            turns = [i for i, leg in enumerate(legs) if leg.turn_rad or leg.curvature_per_m]
-            if not on_line and turns:
-                hops.append(_leg_table(legs[turns[0] : turns[-1] + 1]))
-    return int((~zones.clear_of(hops)).sum()), len(hops)
-
-
-def _leg_table(legs: Sequence[Leg]) -> Array:
-    """Legs as (L, 8), columns as of `COLUMNS`: the inverse of `route_of`."""
-    return np.array(
-        [
-            (*leg.start_ne_m, leg.heading_rad, leg.length_m, leg.curvature_per_m, leg.line,
-             leg.turn_rad, leg.side_rad)
-            for leg in legs
-        ]
-    )  # fmt: skip
+        What continues a line, ahead or astern, passes as the line does.
+        """
+        hops = []
+        for dive in dives:
+            for on_line, group in groupby(dive.route.legs, lambda leg: leg.line >= 0):
+                legs = np.array([(*place, *rest) for place, *rest in map(astuple, group)])
+                turns = np.flatnonzero(legs[:, 6] + legs[:, 4])
+                if len(turns) and not on_line:
+                    hops.append(legs[turns[0] : turns[-1] + 1])
+        return int((~self.clear(hops)).sum()), len(hops)
 
 
 class Manoeuvre(NamedTuple):
@@ -219,10 +177,9 @@ def legs_through(
         raise PlanError("there is no line to fly")
     _check_lines(table, how.ways, first_line)
     starts, ends = table[:, [0, 1, 4]], table[:, 2:]
-    along_m = np.hypot(*(ends - table[:, :3])[:, :2].T)
     begin, finish = np.empty((0, COLUMNS)), np.empty((0, COLUMNS))
     if home_ne is None:
-        hops, kinds = _hops(ends[:-1], starts[1:], how, np.stack([along_m[:-1], along_m[1:]], 1))
+        hops, kinds = _hops(ends[:-1], starts[1:], how)
         begin = _straight(_run_in_starts(starts[:1], how), starts[:1])
         leaving = ends[-1:] + how.run_in_m * _ahead(ends[-1:], flat=True)
         if how.ways.free_many(ends[-1:, :2], leaving[:, :2])[0]:
@@ -230,9 +187,8 @@ def legs_through(
     else:
         leave, enter = np.array([[*(start_ne or home_ne), np.nan]]), np.array([[*home_ne, np.nan]])
         (begin, *hops, finish), kinds = _hops(
-            np.concatenate([leave, ends]), np.concatenate([starts, enter]), how,
-            np.stack([np.append(0.0, along_m), np.append(along_m, 0.0)], axis=1),
-        )  # fmt: skip
+            np.concatenate([leave, ends]), np.concatenate([starts, enter]), how
+        )
         kinds = kinds[1:-1]
     _warn_of_others(kinds, how.turns)
     lines = _line_legs(table, first_line)
@@ -250,9 +206,8 @@ def legs_alone(
         begin by turns: a line's own leg is the last of its way out.
     """
     home = np.full((len(table), 3), [*home_ne, np.nan])
-    along_m = np.hypot(*(table[:, 2:4] - table[:, :2]).T)
-    out, _ = _hops(home, table[:, [0, 1, 4]], how, np.stack([0.0 * along_m, along_m], axis=1))
-    back, _ = _hops(table[:, 2:], home, how, np.stack([along_m, 0.0 * along_m], axis=1))
+    out, _ = _hops(home, table[:, [0, 1, 4]], how)
+    back, _ = _hops(table[:, 2:], home, how)
     lines = _line_legs(table, 0)
     pieces = []
     for there, line, home_again in zip(out, lines, back, strict=True):
@@ -336,77 +291,54 @@ def _wrap(angle: Array) -> Array:
     return np.where(_FULL - wrapped < _TINY, 0.0, wrapped)
 
 
-def _hops(
-    ends: Array, goals: Array, how: Manoeuvre, lengths_m: Array
-) -> tuple[list[Array], NDArray[np.int64]]:
-    """The cheapest ways, as of `_cheapest`, or longer ones where the hull would touch a zone.
-
-    Args:
-        ends: (N, 3), as of `_cheapest`.
-        goals: (N, 3).
-        how: turns, what they cost, and where they are allowed.
-        lengths_m: (N, 2) of the lines that end and begin there.
-    """
+def _hops(ends: Array, goals: Array, how: Manoeuvre) -> tuple[list[Array], NDArray[np.int64]]:
+    """As `_cheapest`; where the hull would touch a zone, by places with room to turn."""
     hops, kinds = _cheapest(ends, goals, how)
     if how.zones is None:
         return hops, kinds
-    rows = np.flatnonzero(~how.zones.clear_of(hops) & (kinds != _AHEAD))
-    for ways in how.zones.spaces:
-        leave = _retreats(ends[rows], -lengths_m[rows, 0], how, ways)
-        enter = _retreats(goals[rows], lengths_m[rows, 1], how, ways)
-        found = np.isfinite(leave[:, 0] + enter[:, 0])
-        found[found] = np.isfinite(ways.lengths_m(leave[found, :2], enter[found, :2]))
-        done, leave, enter = rows[found], leave[found], enter[found]
-        between, kinds[done] = _cheapest(leave, enter, how._replace(ways=ways, zones=None))
-        away, back = _along(ends[done], leave), _along(enter, goals[done])
-        for i, *legs in zip(done.tolist(), away, between, back, strict=True):
-            hops[i] = np.concatenate(legs)
-        rows = rows[~found]
+    rows = np.flatnonzero(~how.zones.clear(hops) & (kinds != _AHEAD))
+    leave, enter = _retreats(ends[rows], -1.0, how), _retreats(goals[rows], 1.0, how)
+    found = np.isfinite(leave[:, 0] + enter[:, 0])
+    found[found] = np.isfinite(how.zones.ways.lengths_m(leave[found, :2], enter[found, :2]))
+    rows, leave, enter = rows[found], leave[found], enter[found]
+    there = how._replace(ways=how.zones.ways, zones=None)
+    between, kinds[rows] = _cheapest(leave, enter, there)
+    away, back = _along(ends[rows], leave), _along(enter, goals[rows])
+    for i, *legs in zip(rows.tolist(), away, between, back, strict=True):
+        hops[i] = np.concatenate(legs)
     return hops, kinds
 
 
-def _retreats(places: Array, lines_m: Array, how: Manoeuvre, room: Ways) -> Array:
-    """The nearest places along lines, (N, 3), where the hull may turn freely.
+def _retreats(places: Array, astern: float, how: Manoeuvre) -> Array:
+    """The nearest places in line with places, (N, 3), where the hull may turn freely; else NaN.
 
-    Beyond a line's ends they are no farther than the hull is long: all that it passes over on the
-    way is under it at the line's end, or there.
-
-    Args:
-        places: (N, 3) at the ends of lines.
-        lines_m: (N,) how far the lines go ahead from there; negative if they lie behind.
-        how: where the vehicle may be, its hull, and how it goes astern.
-        room: ways with room to turn.
-
-    Returns:
-        NaN where there is none near enough.
+    They are no farther than the hull is long: all that it passes over on the way is under it at one
+    of both ends. To one side, `astern`, the vehicle goes or comes astern, if it can.
     """
-    hull_m = 0.0 if how.zones is None else how.zones.length_m
-    steps = np.arange(MAX_SWAY_M / _BACK_STEP_M)
-    away_m = _BACK_STEP_M * np.stack([steps, -steps], axis=1).ravel()
+    hull_m, ways = (0.0, how.ways) if how.zones is None else (how.zones.hull_m, how.zones.ways)
+    steps = _BACK_STEP_M * np.arange(hull_m / _BACK_STEP_M)
+    away_m = np.stack([astern * steps, -astern * steps], axis=1).ravel()
     reached = places[:, None] + away_m[:, None] * _ahead(places, flat=True)[:, None]
-    possible = room.inside(reached[..., :2].reshape(-1, 2)).reshape(reached.shape[:2])
-    possible &= away_m <= np.maximum(lines_m, 0.0)[:, None] + hull_m
-    possible &= away_m >= np.minimum(lines_m, 0.0)[:, None] - hull_m
-    backs = (away_m != 0.0) & ((away_m > 0.0) == (lines_m > 0.0)[:, None])
-    can_back = np.isfinite(power_at(how.costs.sway_w, np.nan_to_num(places[:, 2]) + math.pi))
-    possible &= ~backs | can_back[:, None]
+    possible = ways.inside(reached[..., :2].reshape(-1, 2)).reshape(reached.shape[:2])
+    cannot = np.isinf(power_at(how.costs.sway_w, np.nan_to_num(places[:, 2]) + math.pi))
+    possible[np.outer(cannot, astern * away_m > 0.0)] = False
     nearest = reached[np.arange(len(places)), np.argmax(possible, axis=1)]
     some = possible.any(axis=1) & how.ways.free_many(places[:, :2], nearest[:, :2])
-    nearest[~some, 0] = np.nan
+    nearest[~some] = np.nan
     return nearest
 
 
 def _along(starts: Array, ends: Array) -> list[Array]:
-    """Straights ahead and steps astern on a heading, each (1, 8); (0, 8) between the same place."""
+    """Straights ahead, or steps astern, (1, 8) each; (0, 8) from a place to itself."""
     moves = (ends - starts)[:, :2]
-    astern = (moves * _ahead(starts)).sum(axis=1) < 0.0
-    legs = _leg(starts, starts[:, 2] + math.pi * astern, np.hypot(*moves.T))
-    legs[:, 7] = -math.pi * astern
+    side = np.where((moves * _ahead(starts)).sum(axis=1) < 0.0, -math.pi, 0.0)
+    legs = _leg(starts, starts[:, 2] - side, np.hypot(*moves.T))
+    legs[:, 7] = side
     return [leg[leg[:, 3] > 0.0] for leg in legs[:, None]]
 
 
 def _cheapest(ends: Array, goals: Array, how: Manoeuvre) -> tuple[list[Array], NDArray[np.int64]]:
-    """The cheapest ways from ends of lines to starts of others, best without touching a zone.
+    """The cheapest ways from ends of lines to starts of others, clear of zones where one is.
 
     Args:
         ends: (N, 3) north, east, heading at the end of a line; a heading of NaN is free (home).
@@ -424,7 +356,7 @@ def _cheapest(ends: Array, goals: Array, how: Manoeuvre) -> tuple[list[Array], N
                _turn_in_place(ends, goals, how), _sideways(ends, goals, how)]  # fmt: skip
     joules = np.stack([prices_j(how.costs, legs) for legs in choices])
     if how.zones is not None:
-        joules += [_DEAR_J * ~how.zones.clear_of(legs) for legs in choices]
+        joules += [_DEAR_J * ~how.zones.clear(legs) for legs in choices]
     joules[0] = np.where(on, -np.inf, np.inf)
     blocked = np.isinf(joules[2])
     if requested != _NONE:

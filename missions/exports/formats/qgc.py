@@ -27,6 +27,9 @@ _ARDUPILOT, _SUBMARINE = 3, 12
 _ALTITUDE_MODES = {mavlink.FRAME_ABOVE_HOME: 1, mavlink.FRAME_ABOVE_TERRAIN: 4}
 """QGroundControl's own numbers for MAVLink frames."""
 _MIXED = 0
+_STOP_M = 0.55
+"""How near to a place where ArduSub stops it surely stays: its law goes up to 0.52 m beyond the end
+of a way of 1.5 m in simulation."""
 
 
 def write_qgc(path: Path, export: Export, dive: int) -> None:
@@ -79,7 +82,7 @@ def _fence(export: Export, *, first: bool) -> list[dict[str, Any]]:
     """The areas of the glass as those of the vehicle's reference point, a lever arm away.
 
     The allowed area grows by the lever arm. A zone to keep out of stays as it is, but for where the
-    reference point has to pass so that the glass flies its lines, with the tolerance to each side.
+    reference point has to pass so that the glass flies its lines, and what it needs to each side.
     """
     plan, area = export.plan, export.plan.area
     grown = area.allowed.buffer(export.mount.reach_m, join_style="mitre")
@@ -89,7 +92,9 @@ def _fence(export: Export, *, first: bool) -> list[dict[str, Any]]:
     holes = [Polygon(hole) for part in area.allowed.geoms for hole in part.interiors]
     zones = [*(hole for hole in holes if not said.contains(hole)), *area.no_go.geoms]
     tracks = [[point.vehicle_ne_m for point in points] for points in export.dives]
-    passed = shapely.MultiLineString(tracks).buffer(2.0 * export.tolerance_m)
+    stops = [point.vehicle_ne_m for points in export.dives for point in points if point.hold_s]
+    passed = shapely.MultiLineString(tracks).buffer(2.0 * export.tolerance_m, 4)
+    passed = passed.union(shapely.MultiPoint(stops).buffer(_STOP_M, 4))
     crossed = lost = 0
     for zone in zones:
         parts = [zone]
