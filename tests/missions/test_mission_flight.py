@@ -148,6 +148,30 @@ def test_cola2_is_off_its_line_by_the_closed_form(
     assert heading == pytest.approx(-math.degrees(math.asin(wanted / delta_m)), abs=2.0)  # upstream
 
 
+@pytest.mark.parametrize(
+    ("vehicle", "margin_m", "current"),
+    [("alice", None, 0.0), ("alice", 1.0, 0.0), ("alice", None, 0.1), ("sparus2", 1.5, 0.0)],
+)
+def test_cola2_leaves_the_area_by_no_more_than_is_stated(
+    vehicle: str, margin_m: float | None, current: float, tmp_path: Path
+) -> None:
+    sea = {"current_mps": current, "current_towards_deg": 90.0}
+    config = calm(sea=sea, vehicle={"name": vehicle})
+    config = change_section(config, "area", turn_margin_m=margin_m)
+    plan = planned(change_section(config, "vehicle", name="alice"))
+    flight = fly(plan, exported(plan, config, "cola2", tmp_path))
+    about = (tmp_path / "about.txt").read_text()
+
+    stated_m = float(re.search(r"allowed area by up to ([0-9.]+) m", about)[1])
+    assert flight.expected_outside_m == pytest.approx(stated_m, abs=0.006)
+    worst_m = flight.outside_m.max()
+    assert worst_m < stated_m + plan.allowed_offset_m
+    assert worst_m > stated_m - 0.6  # no free pass
+    if margin_m is None:  # there is room
+        assert stated_m < (0.25 if current else 0.1)
+        assert flight.stations_off_line < 0.05 * plan.stations
+
+
 def test_ardusub_holds_its_line_in_a_current_at_its_speed(tmp_path: Path) -> None:
     sea = {"current_mps": 0.1, "current_towards_deg": 90.0}
     config = exported(long_line(), calm(sea=sea), "wpl", tmp_path)

@@ -10,13 +10,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import shapely
 from hypothesis import given, settings
 from mavsdk.component_type import ComponentType
 from mavsdk.mavsdk import Configuration, Mavsdk
 from mavsdk.plugins.mission_raw.mission_raw import MissionRaw
 from pymavlink import mavwp
 from pymavlink.dialects.v20 import ardupilotmega as dialect
-from shapely.geometry import Point, Polygon
+from shapely.geometry import Point, Polygon, box
 
 from camera_calib.rig import Rig
 from missions.exports.format import line_tolerance_m
@@ -166,18 +167,28 @@ def test_the_fence_holds_the_vehicle_and_keeps_it_out(
             assert not outside.contains(flown)
 
 
-def test_a_zone_that_the_reference_point_must_cut_is_shrunk_or_left_out(
+def test_a_zone_that_the_reference_point_must_cut_is_cut_or_left_out(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    survey = Polygon(
-        [(-0.1, -0.5), (5.1, -0.5), (5.1, 6.0), (-0.1, 6.0)],
-        [[(2.0, -0.2), (2.0, 0.1), (2.4, 0.1), (2.4, -0.2)]],
-    )
-    plan = plan_of([line((0.2, 0.0), (4.8, 0.0))], [(0, 0)], survey=survey)
+    small = box(2.0, -0.2, 2.4, 0.1)
+    zones = [small, box(0.8, 3.0, 4.2, 3.3), box(2.0, 5.0, 2.4, 5.4)]
+    rings = [list(zone.exterior.coords) for zone in zones]
+    survey = Polygon([(-0.1, -0.5), (5.1, -0.5), (5.1, 6.0), (-0.1, 6.0)], rings)
+    lines = [line((0.2, 0.0), (4.8, 0.0)), line((2.2, 2.0), (2.2, 4.6))]
+    plan = plan_of(lines, [(0, 0), (1, 1)], survey=survey)
     written(plan, RIG, ["qgc"], tmp_path)
-    data = json.loads((tmp_path / "mission_dive1.plan").read_text())
-    assert [p["inclusion"] for p in data["geoFence"]["polygons"]] == [True]
-    assert "0.12 m2" in capsys.readouterr().err
+    for dive in (1, 2):
+        data = json.loads((tmp_path / f"mission_dive{dive}.plan").read_text())
+        rings = [p["polygon"] for p in data["geoFence"]["polygons"] if not p["inclusion"]]
+        corners = [plan.datum.ned_from_geodetic(np.pad(r, [(0, 0), (0, 1)])) for r in rings]
+        fenced = shapely.union_all([Polygon(ring[:, :2]) for ring in corners])
+        assert fenced.intersection(small).area < 1e-6
+        parts = fenced.intersection(zones[1])
+        assert len(parts.geoms) > 1  # to both sides of the way of the second dive
+        assert 0.2 < parts.area / zones[1].area < 0.8
+        assert fenced.intersection(zones[2]).area == pytest.approx(zones[2].area, rel=1e-6)
+    said = [text for text in capsys.readouterr().err.splitlines() if "fence" in text]
+    assert len(said) == 1 and "2 of 3" in said[0] and "1 of them" in said[0]
 
 
 def test_a_plan_and_the_wpl_say_the_same(tmp_path: Path, import_plan: Importer) -> None:
