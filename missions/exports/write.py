@@ -269,10 +269,11 @@ def _cola2(export: Export, files: Iterable[Path], *, chosen: bool) -> list[str]:
     expected = (
         f"in the expected current of {follower.current_mps:g} m/s COLA2 holds {follower.name} up "
         f"to {offset_m:.2f} m off lines {plan.line_spacing_m:.2f} m apart, which allow "
-        f"{allowed_m:.2f} m; turns and gusts come on top"
+        f"{allowed_m:.2f} m, and up to {off_m.max():.2f} m in gusts and where lines begin"
     )
-    # Beyond half of its speed turns leave more of the area unseen.
+    # Beyond half of its speed, and on wide circles, turns leave more of the area unseen.
     exceeds = offset_m > allowed_m or follower.current_mps > 0.5 * plan.speed_mps
+    exceeds |= follower.circle_m > 0.5 * plan.line_spacing_m
     if exceeds and (chosen or not follower.sways):
         towards_deg = math.degrees(math.atan2(*follower.current_ne_mps[::-1])) % 180.0
         warn(
@@ -288,8 +289,7 @@ def _cola2(export: Export, files: Iterable[Path], *, chosen: bool) -> list[str]:
         f"  section/min_surge_velocity {own.min_surge_mps:g} m/s",
         f"  section/max_surge_velocity {own.max_surge_mps:g} m/s",
         f"{expected[0].upper()}{expected[1:]}.",
-        f"With gusts, and where lines begin, up to {off_m.max():.2f} m; in turns it leaves the "
-        f"allowed area by up to {outside_m:.2f} m: area.turn_margin_m gives it more room.",
+        f"In turns it leaves the allowed area by up to {outside_m:.2f} m (area.turn_margin_m).",
     ]
 
 

@@ -346,7 +346,7 @@ def flight_summary(flight: Flight, vehicle: VehicleConfig, rig: Rig) -> dict[str
         "outside_allowed": {
             "share_of_time": float(np.mean(flight.outside_m > 0.0)),
             "worst_m": float(flight.outside_m.max()),
-            "allowed_m": plan.allowed_offset_m + flight.expected_outside_m,
+            "allowed_m": flight.allowed_outside_m,
         },
         "on_lines": {
             "share_of_time": float(on_line.mean()),

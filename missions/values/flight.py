@@ -97,6 +97,11 @@ class Flight:
         neighbours_meet_m = np.full(len(self.plan.lines), self.plan.allowed_offset_m)
         return np.maximum(neighbours_meet_m, self.expected_off_m)
 
+    @property
+    def allowed_outside_m(self) -> float:
+        """How far it may leave the allowed area: as a picture its line, and what is expected."""
+        return self.plan.allowed_offset_m + self.expected_outside_m
+
     @cached_property
     def stations_off_line(self) -> int:
         """How many pictures were truly taken farther off their line than is allowed."""

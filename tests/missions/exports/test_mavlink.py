@@ -171,7 +171,7 @@ def test_a_zone_that_the_reference_point_must_cut_is_cut_or_left_out(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     small = box(2.0, -0.2, 2.4, 0.1)
-    zones = [small, box(0.8, 3.0, 4.2, 3.3), box(2.0, 5.0, 2.4, 5.4)]
+    zones = [small, box(0.8, 3.0, 4.2, 3.3), box(4.0, 5.2, 4.5, 5.7)]
     rings = [list(zone.exterior.coords) for zone in zones]
     survey = Polygon([(-0.1, -0.5), (5.1, -0.5), (5.1, 6.0), (-0.1, 6.0)], rings)
     lines = [line((0.2, 0.0), (4.8, 0.0)), line((2.2, 2.0), (2.2, 4.6))]
@@ -186,7 +186,7 @@ def test_a_zone_that_the_reference_point_must_cut_is_cut_or_left_out(
         parts = fenced.intersection(zones[1])
         assert len(parts.geoms) > 1  # to both sides of the way of the second dive
         assert 0.2 < parts.area / zones[1].area < 0.8
-        assert fenced.intersection(zones[2]).area == pytest.approx(zones[2].area, rel=1e-6)
+        assert fenced.intersection(zones[2]).area == pytest.approx(zones[2].area, rel=1e-5)
     said = [text for text in capsys.readouterr().err.splitlines() if "fence" in text]
     assert len(said) == 1 and "2 of 3" in said[0] and "1 of them" in said[0]
 
