@@ -148,21 +148,25 @@ def swing_ne_m(follower: Follower, way_ne: Array, lever_m: float) -> Array:
     return ahead_m * way_ne + carried_s * np.array(follower.current_ne_mps)
 
 
-def expected_off_m(follower: Follower, plan: Plan, lever_m: float, tolerance_m: float) -> Array:
-    """How far off each line, (L,), COLA2 brings the glass: where it begins, and in a current."""
-    across = np.array([abs(follower.across_mps(line.heading_rad)) for line in plan.lines])
-    drifts = [steady_drift(mps + follower.gust_mps, plan.speed_mps) for mps in across.tolist()]
-    off_m: Array = tolerance_m + (follower.delta_m - lever_m) * np.array(drifts)
-    return off_m
+def expected_m(
+    follower: Follower, plan: Plan, lever_m: float, mission: Mission
+) -> tuple[Array, float]:
+    """How far off each of a plan's lines, (L,), and out of its area COLA2 brings the glass.
 
-
-def expected_outside_m(follower: Follower, plan: Plan, lever_m: float, mission: Mission) -> float:
-    """How far out of the allowed area COLA2 brings the glass at the ends of a mission's steps."""
+    Off lines by the tolerance at their starts and what the current adds, out of the area where
+    steps end.
+    """
+    across = (abs(follower.across_mps(line.heading_rad)) for line in plan.lines)
+    drift = [steady_drift(mps + follower.gust_mps, plan.speed_mps) for mps in across]
+    tolerance_m = max(step.tolerance_m for step in mission.steps if step.camera == "off")
     ends = mission.ends_ne(plan.datum)
     ways = np.diff(ends, axis=0, prepend=ends[:1])
     ways /= np.maximum(np.hypot(*ways.T), 1e-9)[:, None]
-    places = shapely.points(ends + swing_ne_m(follower, ways, lever_m))
-    return float(np.max(shapely.distance(plan.area.allowed, places)))
+    outside = shapely.points(ends + swing_ne_m(follower, ways, lever_m))
+    return (
+        tolerance_m + (follower.delta_m - lever_m) * np.array(drift),
+        float(np.max(shapely.distance(plan.area.allowed, outside))),
+    )
 
 
 def cola2_settings(delta_m: float, speed_mps: float) -> Cola2Settings:

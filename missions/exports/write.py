@@ -14,14 +14,9 @@ from alice_survey.core.run import progress
 from alice_survey.kit.words import count
 from alice_survey.sim.vehicle.pilot.mission import MIN_RADIUS_M, MIN_SPEED_MPS, Cola2Settings
 from camera_calib.rig import Rig, design_rig
-from missions.exports.follower import (
-    cola2_settings,
-    expected_off_m,
-    expected_outside_m,
-    line_offset_m,
-)
+from missions.exports.follower import cola2_settings, expected_m, line_offset_m
 from missions.exports.format import Export, ExportFormat, Options, line_tolerance_m, options_of
-from missions.exports.registry import format_named, format_names
+from missions.exports.registry import format_named, format_names, read_mission
 from missions.values.plan_file import Plan, read_plan
 
 SUMS = "SHA256SUMS"
@@ -253,7 +248,6 @@ def _cola2(export: Export, files: Iterable[Path], *, chosen: bool) -> list[str]:
         return []
     if not math.isfinite(follower.delta_m):
         return [f"COLA2: no section/delta keeps {follower.name} from weaving: lower the speed."]
-    read = format_named("cola2").read
     own, default = cola2_settings(follower.delta_m, plan.speed_mps), Cola2Settings()
     lever_m, allowed_m = export.mount.glass_body_m[0], plan.allowed_offset_m
     offsets = [
@@ -262,14 +256,17 @@ def _cola2(export: Export, files: Iterable[Path], *, chosen: bool) -> list[str]:
         if line.kind in ("survey", "fill")
     ]
     offset_m = max(offsets, default=0.0)
-    missions = [read(path.read_text("utf-8")) for path in files if read and path.suffix == ".xml"]
-    places = (expected_outside_m(follower, plan, lever_m, m) for m in missions if m)
-    outside_m = max(places, default=0.0)
-    off_m = expected_off_m(follower, plan, lever_m, export.cola2_tolerance_m)
+    flown = [
+        expected_m(follower, plan, lever_m, read_mission(path))
+        for path in files
+        if path.suffix == ".xml"
+    ]
+    off_m = max((off_m.max() for off_m, _ in flown), default=0.0)
+    outside_m = max((outside_m for _, outside_m in flown), default=0.0)
     expected = (
         f"in the expected current of {follower.current_mps:g} m/s COLA2 holds {follower.name} up "
         f"to {offset_m:.2f} m off lines {plan.line_spacing_m:.2f} m apart, which allow "
-        f"{allowed_m:.2f} m, and up to {off_m.max():.2f} m in gusts and where lines begin"
+        f"{allowed_m:.2f} m, and up to {off_m:.2f} m in gusts and where lines begin"
     )
     # Beyond half of its speed, and on wide circles, turns leave more of the area unseen.
     exceeds = offset_m > allowed_m or follower.current_mps > 0.5 * plan.speed_mps

@@ -82,14 +82,7 @@ from alice_survey.sim.vehicle.vehicle import Vehicle
 from camera_calib.rig import Rig
 from missions.coverage.certificate import certificate
 from missions.coverage.stations import MAX_ALTITUDES, Stations, plan_pattern, stations_of_plan
-from missions.exports.follower import (
-    cola2_delta_m,
-    cola2_settings,
-    expected_off_m,
-    expected_outside_m,
-    follower_of,
-    sways,
-)
+from missions.exports.follower import cola2_delta_m, cola2_settings, expected_m, follower_of, sways
 from missions.exports.geometry import CameraMount
 from missions.exports.registry import read_mission
 from missions.plan.planner import area_bathymetry
@@ -636,12 +629,7 @@ def simulate_mission(
         return flight
     follower = follower_of(vehicle, settings.sea, plan.speed_mps)
     lever_m = settings.camera.position_body_m[0]
-    tolerance_m = max(step.tolerance_m for step in known.mission.steps if step.camera == "off")
-    return replace(
-        flight,
-        expected_off_m=expected_off_m(follower, known.plan, lever_m, tolerance_m),
-        expected_outside_m=expected_outside_m(follower, known.plan, lever_m, known.mission),
-    )
+    return replace(flight, expected_m=expected_m(follower, known.plan, lever_m, known.mission))
 
 
 def mission_of_settings(plan: Plan, settings: FlightSettings) -> MissionOfPlan:

@@ -45,10 +45,8 @@ class Flight:
     flown: Flown
     ending: str
     """Why the flight ended, in words."""
-    expected_off_m: Array | float = 0.0
-    """(L,) how far off the plan's lines the law of an autopilot is expected to bring the glass."""
-    expected_outside_m: float = 0.0
-    """How far out of the allowed area."""
+    expected_m: tuple[Array | float, float] = (0.0, 0.0)
+    """How far off lines, (L,), and out of the area the law of an autopilot should bring it."""
 
     @cached_property
     def attitude_rad(self) -> Array:
@@ -94,13 +92,13 @@ class Flight:
     @property
     def allowed_off_m(self) -> Array:
         """(L,) how far off each of the plan's lines its pictures may be."""
-        neighbours_meet_m = np.full(len(self.plan.lines), self.plan.allowed_offset_m)
-        return np.maximum(neighbours_meet_m, self.expected_off_m)
+        allowed_m: Array = np.maximum(self.expected_m[0], [self.plan.allowed_offset_m])
+        return np.broadcast_to(allowed_m, len(self.plan.lines))
 
     @property
     def allowed_outside_m(self) -> float:
         """How far it may leave the allowed area: as a picture its line, and what is expected."""
-        return self.plan.allowed_offset_m + self.expected_outside_m
+        return self.plan.allowed_offset_m + self.expected_m[1]
 
     @cached_property
     def stations_off_line(self) -> int:

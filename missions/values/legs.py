@@ -9,7 +9,7 @@ What a vehicle does at each leg, by what its fields say:
 - turn on the spot (`turn_rad` not 0; length, curvature and side 0): it stands at `start_ne_m`,
   turns by `turn_rad` from `heading_rad` the way its sign says (positive to starboard), and stands
   still again. At most half a turn.
-- sway step (`side_rad` exactly +-pi/2 or +-pi; curvature and turn 0): it stands, moves aside along its
+- sway step (`side_rad` exactly +-pi/2 or +-pi; curvature and turn 0): it stands, moves along its
   course at `Costs.sway_mps` with its heading held at `heading_rad + side_rad`, and stands again:
   with +pi/2 it moves to port, with -pi/2 to starboard, with +-pi astern.
 
@@ -52,7 +52,7 @@ class Leg:
     turn_rad: float = 0.0
     """How far the vehicle turns on the spot, positive to starboard; 0 of all other legs."""
     side_rad: float = 0.0
-    """The vehicle's heading minus the course: 0 where it goes ahead, +-pi/2 in a sway step, +-pi astern."""
+    """The vehicle's heading minus the course: 0 where it goes ahead, +-pi/2 or +-pi in a sway step."""
 
     @property
     def kind(self) -> LegKind:
