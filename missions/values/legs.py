@@ -52,7 +52,7 @@ class Leg:
     turn_rad: float = 0.0
     """How far the vehicle turns on the spot, positive to starboard; 0 of all other legs."""
     side_rad: float = 0.0
-    """The vehicle's heading minus the course: 0 where it goes ahead, +-pi/2 or +-pi where it steps."""
+    """The vehicle's heading minus the course: 0 ahead, +-pi/2 or +-pi in a sway step."""
 
     @property
     def kind(self) -> LegKind:
