@@ -322,7 +322,7 @@ def _retreats(places: Array, astern: float, how: Manoeuvre) -> Array:
     possible = ways.inside(reached[..., :2].reshape(-1, 2)).reshape(reached.shape[:2])
     cannot = np.isinf(power_at(how.costs.sway_w, np.nan_to_num(places[:, 2]) + math.pi))
     possible[np.outer(cannot, astern * away_m > 0.0)] = False
-    nearest = reached[np.arange(len(places)), np.argmax(possible, axis=1)]
+    nearest: Array = reached[np.arange(len(places)), np.argmax(possible, axis=1)]
     some = possible.any(axis=1) & how.ways.free_many(places[:, :2], nearest[:, :2])
     nearest[~some] = np.nan
     return nearest

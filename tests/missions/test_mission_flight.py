@@ -162,7 +162,8 @@ def test_cola2_leaves_the_area_by_no_more_than_is_stated(
     flight = fly(plan, exported(plan, config, "cola2", tmp_path))
     about = (tmp_path / "about.txt").read_text()
 
-    stated_m = float(re.search(r"allowed area by up to ([0-9.]+) m", about)[1])
+    (stated,) = re.findall(r"allowed area by up to ([0-9.]+) m", about)
+    stated_m = float(stated)
     assert flight.expected_m[1] == pytest.approx(stated_m, abs=0.006)
     worst_m = flight.outside_m.max()
     assert worst_m < stated_m + plan.allowed_offset_m

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 import shapely
 from shapely.geometry import Point, Polygon, box
+from shapely.geometry.base import BaseGeometry
 
+from alice_survey.core.config import SurveyConfig
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.vehicle import vehicle_from
 from missions.exports.format import options_of
@@ -29,7 +31,7 @@ NARROW = (box(4, 4, 5, 5), box(4, 7, 5, 8))
 HULL, GLASS = vehicle_from("alice").hull, (0.55, -0.05)
 
 
-def config_of(zones: tuple[Polygon, ...], **area: float) -> object:
+def config_of(zones: tuple[Polygon, ...], **area: float) -> SurveyConfig:
     rings = [np.array(zone.exterior.coords)[:-1].tolist() for zone in zones]
     size = {"length_m": 9.0, "width_m": 12.0, "heading_deg": 0.0} | area
     return survey(area={**size, "no_go_ne_m": rings}, sea={"current_mps": 0.0})
@@ -59,7 +61,7 @@ def hulls_of(leg: Leg) -> Array:
     )
 
 
-def lines_own(plan: Plan) -> Polygon:
+def lines_own(plan: Plan) -> BaseGeometry:
     """What is under the hull on lines."""
     swept = [
         hulls_at(line.stations_ne, np.full(line.stations, line.heading_rad)) for line in plan.lines

@@ -93,8 +93,8 @@ def _fence(export: Export, *, first: bool) -> list[dict[str, Any]]:
     zones = [*(hole for hole in holes if not said.contains(hole)), *area.no_go.geoms]
     tracks = [[point.vehicle_ne_m for point in points] for points in export.dives]
     stops = [point.vehicle_ne_m for points in export.dives for point in points if point.hold_s]
-    passed = shapely.MultiLineString(tracks).buffer(2.0 * export.tolerance_m, 4)
-    passed = passed.union(shapely.MultiPoint(stops).buffer(_STOP_M, 4))
+    near = shapely.MultiLineString(tracks).buffer(2.0 * export.tolerance_m, 4)
+    passed = near.union(shapely.MultiPoint(stops).buffer(_STOP_M, 4))
     crossed = lost = 0
     for zone in zones:
         parts = [zone]
