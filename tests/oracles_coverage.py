@@ -104,8 +104,7 @@ def middles_ne(certificate: Certificate) -> Array:
     ahead = np.array([np.cos(grid.heading_rad), np.sin(grid.heading_rad)])
     right = np.array([-ahead[1], ahead[0]])
     row, column = (np.indices(grid.shape)[..., None] + 0.5) * grid.cell_m
-    middles: Array = np.array(grid.origin_ne) + row * ahead + column * right
-    return middles
+    return np.array(grid.origin_ne) + row * ahead + column * right
 
 
 def lawnmower(

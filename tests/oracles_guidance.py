@@ -190,8 +190,7 @@ def smoothed_floor(heard_m: Array, rate_rad_s: float, dt_s: float) -> Array:
     time_s = np.arange(steps) * dt_s / fine
     held = np.repeat(heard_m, fine)[:steps] - heard_m[0]
     system = ([2 * rate_rad_s, rate_rad_s**2], [1.0, 2 * rate_rad_s, rate_rad_s**2])
-    result: Array = lsim(system, held, time_s)[1][::fine] + heard_m[0]
-    return result
+    return lsim(system, held, time_s)[1][::fine] + heard_m[0]
 
 
 def los_offset_m(

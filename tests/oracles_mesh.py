@@ -74,8 +74,7 @@ def surface_points(camera: Camera, world_from_cam: RigidTransform, pixels: Array
     for _ in range(30):
         at = start + along[:, None] * ray
         along = along + (depth_of(at[:, 0], at[:, 1]) - at[:, 2]) / ray[:, 2]
-    points: Array = start + along[:, None] * ray
-    return points
+    return start + along[:, None] * ray
 
 
 def station_pictures(rig: Rig, noise: float, seed: int) -> tuple[Array, Array]:

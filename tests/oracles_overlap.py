@@ -68,8 +68,7 @@ def _nearest(stations: Stations, s: int, line: int) -> list[int]:
     """The pictures of a line that are nearest to another picture: three to either side."""
     rows = np.flatnonzero(stations.line == line)
     away = np.linalg.norm(stations.glass_ne[rows] - stations.glass_ne[s], axis=1)
-    chosen: list[int] = rows[np.argsort(away, kind="stable")[:6]].tolist()
-    return chosen
+    return rows[np.argsort(away, kind="stable")[:6]].tolist()
 
 
 def _pose(rig: Rig, stations: Stations, s: int) -> tuple[Array, Array, float]:
@@ -94,8 +93,7 @@ def _middle_row(rig: Rig, stations: Stations, s: int) -> Array:
     share = ((np.arange(_POINTS) + 0.5) / _POINTS)[:, None]
     points = hits[0] * (1 - share) + hits[1] * share
     points[:, :2] += stations.glass_ne[s]
-    placed: Array = points
-    return placed
+    return points
 
 
 def _sees(rig: Rig, stations: Stations, s: int, points: Array) -> Array:

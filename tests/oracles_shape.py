@@ -509,8 +509,7 @@ def motion_along(points_body: Array, direction_body: Array) -> Array:
 def inertia_of(points_body: Array, direction_body: Array, mass_kg: Array) -> Array:
     """M_A, (6, 6), of masses (N,) that points (N, 3) feel along a direction (3,)."""
     motion = motion_along(points_body, direction_body)
-    matrix: Array = motion.T @ (np.atleast_1d(mass_kg)[:, None] * motion)
-    return matrix
+    return motion.T @ (np.atleast_1d(mass_kg)[:, None] * motion)
 
 
 def drag_of(points_body: Array, direction_body: Array, drag_kg_m: Array) -> Array:
@@ -519,8 +518,7 @@ def drag_of(points_body: Array, direction_body: Array, drag_kg_m: Array) -> Arra
     Entry [i, j] is of force i by motion j alone.
     """
     motion = motion_along(points_body, direction_body)
-    matrix: Array = -motion.T @ (np.atleast_1d(drag_kg_m)[:, None] * motion * np.abs(motion))
-    return matrix
+    return -motion.T @ (np.atleast_1d(drag_kg_m)[:, None] * motion * np.abs(motion))
 
 
 def parts(geometry: Geometry) -> tuple[HullPart, ...]:

@@ -19,8 +19,7 @@ def fresh_density_kg_m3(temperature_c: Array, pressure_dbar: Array | float = 0.0
     ) / (1.0 + 21.65928e-3 * t)  # fmt: skip
     # Tait: stiffness grows by about 6.6 times the pressure (Dymond and Malhotra 1988).
     squeezed = np.log1p(6.6 * per_bar * np.asarray(pressure_dbar) / 10.0) / 6.6
-    density: Array = at_surface * (1.0 + squeezed)
-    return density
+    return at_surface * (1.0 + squeezed)
 
 
 def n_fresh_iapws(temperature_c: Array, density_kg_m3: Array, wavelength_nm: Array) -> Array:
@@ -33,17 +32,13 @@ def n_fresh_iapws(temperature_c: Array, density_kg_m3: Array, wavelength_nm: Arr
         + 2.45934259e-3 / (wave2 - 0.2292020**2) + 0.900704920 / (wave2 - 5.432937**2)
         - 1.66626219e-2 * rho**2
     )  # fmt: skip
-    index: Array = np.sqrt((1.0 + 2.0 * lorentz) / (1.0 - lorentz))
-    return index
+    return np.sqrt((1.0 + 2.0 * lorentz) / (1.0 - lorentz))
 
 
 def n_air(wavelength_nm: Array) -> Array:
     """Standard air relative to vacuum: Ciddor (1996)."""
     wavenumber2 = (1e3 / wavelength_nm) ** 2
-    index: Array = 1.0 + 1e-8 * (
-        5792105.0 / (238.0185 - wavenumber2) + 167917.0 / (57.362 - wavenumber2)
-    )
-    return index
+    return 1.0 + 1e-8 * (5792105.0 / (238.0185 - wavenumber2) + 167917.0 / (57.362 - wavenumber2))
 
 
 def n_sea_millard_seaver(
@@ -66,5 +61,4 @@ def n_sea_millard_seaver(
         + 1.0100326e-10 * p * t**2 + 5.8085198e-15 * p**2 * t**2
     )  # fmt: skip
     both = -1.1177517e-9 * p * s + 5.7311268e-11 * p * t * s - 1.5460458e-12 * p * t**2 * s
-    index: Array = fresh + salt + pressed + both
-    return index
+    return fresh + salt + pressed + both

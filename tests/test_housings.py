@@ -43,8 +43,7 @@ def surveyed(
     (workspace / "survey.toml").write_text(f"{settings}\n[camera]\n{camera}{GLASS}")
     command = [sys.executable, "-m", "alice_survey", "run", "-w", str(workspace), "--quiet"]
     subprocess.run(command, check=True, capture_output=True)
-    score: dict[str, Any] = json.loads((workspace / "evaluation" / "score.json").read_text())
-    return score
+    return json.loads((workspace / "evaluation" / "score.json").read_text())
 
 
 def check(score: dict[str, Any], length_m: float, width_m: float) -> None:

@@ -74,8 +74,7 @@ def compiled_by(command: str, workspace: Path, kept: Path) -> dict[str, dict[str
     subprocess.run(
         call, cwd=workspace, env=os.environ | places, check=True, stdout=subprocess.DEVNULL
     )
-    found: dict[str, dict[str, list[float]]] = json.loads((workspace / "kernels.json").read_text())
-    return found
+    return json.loads((workspace / "kernels.json").read_text())
 
 
 def main() -> None:

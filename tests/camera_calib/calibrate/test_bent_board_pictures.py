@@ -30,8 +30,7 @@ CAMERA = Camera(width_px=640, height_px=480, lens=LENS)
 def depth_m(x_m: Array) -> Array:
     """Of the board, bent on a parabola over its width: 0 at its outer corners."""
     half_m = 0.5 * float(np.ptp(TARGET.points[:, 0]))
-    depth: Array = BOW_M * (1.0 - ((x_m - half_m) / half_m) ** 2)
-    return depth
+    return BOW_M * (1.0 - ((x_m - half_m) / half_m) ** 2)
 
 
 def shoot(folder: Path) -> None:

@@ -87,8 +87,7 @@ def light_of(camera: Camera, cam_from_target: RigidTransform) -> Array:
     def tangents(pixels: Array) -> Array:
         rays = camera.unproject(pixels)[1]
         ahead = np.where(rays[:, 2:] > 0.0, rays[:, 2:], np.nan)
-        found: Array = rays[:, :2] / ahead
-        return found
+        return rays[:, :2] / ahead
 
     size = (camera.width_px, camera.height_px)
     return picture_light(TARGET, matrix, size, fine=10, warp=tangents)

@@ -144,8 +144,7 @@ def _few(linear: LinearObservations, points: int, rng: np.random.Generator) -> L
 
 
 def _sigmas(covariances: Array) -> Array:
-    sigmas: Array = np.sqrt(np.einsum("nii->ni", covariances))
-    return sigmas
+    return np.sqrt(np.einsum("nii->ni", covariances))
 
 
 CALIBRATED_NOISE_PX = 0.1
@@ -277,8 +276,7 @@ def _relative_misses(
     motion = shared.motions[i] - shared.motions[j]
     noise = found.point_noise[rows[i]] + found.point_noise[rows[j]]
     variance = np.diagonal(uncertainty.spread(motion, shared.covariance) + noise, axis1=1, axis2=2)
-    ratios: Array = (misses[rows[i]] - misses[rows[j]]) / np.sqrt(variance)
-    return ratios
+    return (misses[rows[i]] - misses[rows[j]]) / np.sqrt(variance)
 
 
 def test_what_points_share_is_nearly_all_that_poses_do(tmp_path: Path) -> None:

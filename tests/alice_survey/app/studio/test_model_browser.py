@@ -69,8 +69,7 @@ def kept(page: Any) -> list[dict[str, Any]]:
     text = page.evaluate(
         "Object.entries(sessionStorage).find(([key]) => key.startsWith('alice-survey measures'))[1]"
     )
-    found: list[dict[str, Any]] = json.loads(text)
-    return found
+    return json.loads(text)
 
 
 def named(measure: dict[str, Any]) -> dict[str, Any]:

@@ -44,8 +44,7 @@ class Truth:
     def pixel(self, image: str, place: np.ndarray) -> np.ndarray:
         """(2,) from the outer corner of the first pixel."""
         camera = self.rig.cameras[image.split("/")[0]]
-        pixel: np.ndarray = camera.project(self.poses[image].inv().apply(place[None]))[0]
-        return pixel
+        return camera.project(self.poses[image].inv().apply(place[None]))[0]
 
     def nearest(self, place: np.ndarray) -> tuple[str, np.ndarray] | None:
         """The picture that shows a place closest to its middle, and where."""

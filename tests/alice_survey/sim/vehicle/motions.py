@@ -73,8 +73,7 @@ def damping_matrix(body: Body, nu: Array) -> Array:
     lift[1, 1], lift[2, 2] = body.lift[0] * abs(u), body.lift[1] * abs(u)
     lift[4, 2], lift[5, 1] = body.lift[2] * u, body.lift[3] * u
     quadratic = np.where(nu > 0.0, body.quadratic, body.quadratic_back)
-    matrix: Array = -(body.linear + quadratic * np.abs(nu) + lift)
-    return matrix
+    return -(body.linear + quadratic * np.abs(nu) + lift)
 
 
 def drag_power(body: Body, nu: Array) -> Array:

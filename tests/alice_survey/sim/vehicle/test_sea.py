@@ -185,8 +185,7 @@ def tilted(at_origin: float, per_north: float, per_east: float) -> FloorGrid:
 
 
 def unit(vector: Array) -> Array:
-    result: Array = vector / np.linalg.norm(vector)
-    return result
+    return vector / np.linalg.norm(vector)
 
 
 def test_depths_at_nodes_between_them_and_beyond_the_edges() -> None:
