@@ -361,12 +361,12 @@ def only_one(workspace: Path) -> Iterator[None]:
     """Lock the workspace so that no second run writes into it."""
     refuse_links(workspace, workspace / ".lock")
     lock = FileLock(workspace / ".lock", timeout=0)
-    try:
-        with file_faults(workspace, WorkspaceError, "written"):
-            workspace.mkdir(parents=True, exist_ok=True)
+    with file_faults(workspace, WorkspaceError, "written"):
+        workspace.mkdir(parents=True, exist_ok=True)
+        try:
             lock.acquire()
-    except Timeout:
-        raise WorkspaceError(f"another command is working in {workspace}; wait for it") from None
+        except Timeout:
+            raise WorkspaceError(f"another command is working in {workspace}") from None
     try:
         yield
     finally:
