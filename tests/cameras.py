@@ -4,8 +4,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from typing import Any
 
+import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey.sim.seafloor import renderer
 from camera_calib.camera import Camera
 from camera_calib.lenses.opencv import OpenCVLens
 from camera_calib.ports.flat import FlatPort
@@ -69,3 +71,26 @@ def pair_of(left: Camera, right: Camera, right_from_left: RigidTransform) -> Rig
         body_from_rig=RigidTransform.identity(),
         source="a test",
     )
+
+
+def range_map(
+    scene: renderer.Scene, camera: Camera, ned_from_cam: RigidTransform, reach_m: float = 20.0
+) -> np.ndarray:
+    """(H, W) metres to the renderer's sea floor along the axis, from the pupil; NaN on nothing.
+
+    Terrain may be left out beyond `reach_m` of path along rays to the horizon.
+    """
+    pose = RigidTransform.from_matrix(ned_from_cam.as_matrix().reshape(1, 4, 4))
+    patch = renderer._patch_in_sight(scene.terrain, camera, pose, reach_m)
+    places = pose.translation - patch.origin_ned
+    result = np.empty((camera.height_px, camera.width_px), dtype=np.float32)
+    for first, last in renderer.ray_bands(camera, 1):
+        rays = renderer.camera_rays(camera, 1, first, last)
+        moments = np.zeros(len(rays.origins), dtype=np.uint8)
+        world = renderer._to_world(
+            rays.origins, rays.directions, moments, pose.rotation.as_matrix(), places
+        )
+        path = renderer._cast(patch, world)[0]
+        z = rays.origins[:, 2] + path * rays.directions[:, 2]
+        result[first:last] = np.where(np.isfinite(path), z, np.nan).reshape(-1, camera.width_px)
+    return result

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.frames import Array
-from alice_survey.sim.seafloor.renderer import Scene, range_map
+from alice_survey.sim.seafloor.renderer import Scene
 from alice_survey.sim.seafloor.texture import Texture
 from benchmarks.harbour_judge import (
     Truth,
@@ -28,6 +28,7 @@ from benchmarks.harbour_sight import instants_that_see, surface_samples, trace
 from benchmarks.harbour_survey import body_poses, harbour_rig, quick_stations, stations, time_of
 from benchmarks.harbour_truth import clearance, distances, moving_distance, normals, solid_distance
 from camera_calib.camera import Camera
+from tests.cameras import range_map
 
 QUICK = tuple(quick_stations())
 

@@ -110,34 +110,6 @@ def render(
     return picture
 
 
-def range_map(
-    scene: Scene, camera: Camera, ned_from_cam: RigidTransform, reach_m: float = 20.0
-) -> Floats:
-    """Distance to the sea floor along the axis from the entrance pupil, through pixel centres.
-
-    Args:
-        scene: what is there.
-        camera: who looks.
-        ned_from_cam: one pose.
-        reach_m: path along rays to the horizon beyond which terrain may be left out.
-
-    Returns:
-        (H, W) metres; NaN where a ray meets nothing.
-    """
-    pose = RigidTransform.from_matrix(ned_from_cam.as_matrix().reshape(1, 4, 4))
-    patch = _patch_in_sight(scene.terrain, camera, pose, reach_m)
-    places = pose.translation - patch.origin_ned
-    result = np.empty((camera.height_px, camera.width_px), dtype=np.float32)
-    for first, last in ray_bands(camera, 1):
-        rays = camera_rays(camera, 1, first, last)
-        moments = np.zeros(len(rays.origins), dtype=np.uint8)
-        world = _to_world(rays.origins, rays.directions, moments, pose.rotation.as_matrix(), places)
-        path = _cast(patch, world)[0]
-        z = rays.origins[:, 2] + path * rays.directions[:, 2]
-        result[first:last] = np.where(np.isfinite(path), z, np.nan).reshape(-1, camera.width_px)
-    return result
-
-
 def flat_floor_radiance(
     camera: Camera, light: CameraLight, range_m: float, albedo: Array, step_px: int
 ) -> Floats:

@@ -260,8 +260,6 @@ _DESCRIBED = {
 PAPER_SETS = {"estimated": ESTIMATED, "cfd": CFD, "calibrated": CALIBRATED}
 OWN_SET = "calibrated"
 """Stands for a vehicle's own coefficients where none are named."""
-SETS = (*PAPER_SETS, "computed")
-"""Names of the sets of coefficients of vehicles of a geometry."""
 _MERIT = 0.07 / 0.4566**1.5
 """k_q over k_t^1.5 of a Wageningen B propeller with three blades, blade area ratio 0.718, pitch 1,
 in water at rest (k_t 0.4566, k_q 0.0700; T. I. Fossen's MSS toolbox, remus100): 0.227. Where no

@@ -14,13 +14,13 @@ from alice_survey.sim.seafloor.renderer import (
     Scene,
     camera_rays,
     flat_floor_radiance,
-    range_map,
     render,
 )
 from alice_survey.sim.seafloor.terrain import Terrain, TerrainObject, build_terrain
 from alice_survey.sim.seafloor.texture import Texture
 from camera_calib.rig import design_rig
 from camera_calib.water import water_optics
+from tests.cameras import range_map
 from tests.oracles_seafloor import fermat_pixels
 
 CONFIG = SurveyConfig.model_validate({"imaging": {"scale": 16}})

@@ -11,11 +11,12 @@ from hypothesis.extra.numpy import arrays
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
+from alice_survey.core.config import COEFFICIENTS as SETS
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle import dynamics
 from alice_survey.sim.vehicle.propulsion import add_thrust
 from alice_survey.sim.vehicle.sea import GRAVITY, Current, constant_current, sheared_current
-from alice_survey.sim.vehicle.vehicle import SETS, Vehicle, vehicle_from
+from alice_survey.sim.vehicle.vehicle import Vehicle, vehicle_from
 from tests import oracles_dynamics as oracle
 from tests.alice_survey.sim.vehicle import motions as m
 

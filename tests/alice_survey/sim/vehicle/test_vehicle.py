@@ -8,12 +8,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from alice_survey.core.config import COEFFICIENTS as SETS
 from alice_survey.core.errors import VehicleError
 from alice_survey.sim.vehicle import vehicle as files
 from alice_survey.sim.vehicle.coefficients import Coefficients
 from alice_survey.sim.vehicle.propulsion import add_thrust
 from alice_survey.sim.vehicle.sea import GRAVITY
-from alice_survey.sim.vehicle.vehicle import SETS, vehicle_from
+from alice_survey.sim.vehicle.vehicle import vehicle_from
 from tests.alice_survey.sim.vehicle.motions import block
 from tests.oracles_shape import ALICE, SPARUS2
 

@@ -8,11 +8,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from alice_survey.core.config import COEFFICIENTS as SETS
 from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.dynamics import Body, add_coriolis, add_damping
 from alice_survey.sim.vehicle.pilot import gains as g
-from alice_survey.sim.vehicle.vehicle import SETS, Vehicle, vehicle_from
+from alice_survey.sim.vehicle.vehicle import Vehicle, vehicle_from
 from tests.alice_survey.sim.vehicle import motions as m
 from tests.alice_survey.sim.vehicle.pilot.pilot_runs import gains_of
 from tests.oracles_navigation import jacobian
