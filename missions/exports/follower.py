@@ -122,6 +122,13 @@ def line_offset_m(
     return math.copysign(steady_drift(across, speed_mps) * (follower.delta_m - lever_m), across)
 
 
+def off_lines_m(follower: Follower, plan: Plan, lever_m: float) -> Array:
+    """How far off each of a plan's lines, (L,), COLA2 holds the glass in current and gusts."""
+    across = (abs(follower.across_mps(line.heading_rad)) for line in plan.lines)
+    drift = [steady_drift(mps + follower.gust_mps, plan.speed_mps) for mps in across]
+    return (follower.delta_m - lever_m) * np.array(drift)
+
+
 def end_tolerance_m(follower: Follower) -> float:
     """Least tolerance at which COLA2 does not circle the end of a step in the expected current.
 
@@ -156,15 +163,13 @@ def expected_m(
     Off lines by the tolerance at their starts and what the current adds, out of the area where
     steps end.
     """
-    across = (abs(follower.across_mps(line.heading_rad)) for line in plan.lines)
-    drift = [steady_drift(mps + follower.gust_mps, plan.speed_mps) for mps in across]
     tolerance_m = max(step.tolerance_m for step in mission.steps if step.camera == "off")
     ends = mission.ends_ne(plan.datum)
     ways = np.diff(ends, axis=0, prepend=ends[:1])
     ways /= np.maximum(np.hypot(*ways.T), 1e-9)[:, None]
     outside = shapely.points(ends + swing_ne_m(follower, ways, lever_m))
     return (
-        tolerance_m + (follower.delta_m - lever_m) * np.array(drift),
+        tolerance_m + off_lines_m(follower, plan, lever_m),
         float(np.max(shapely.distance(plan.area.allowed, outside))),
     )
 

@@ -52,31 +52,33 @@ def write_exports(
             left out with a warning.
     """
     names = format_names() if formats is None else list(formats)
-    chosen = [format_named(name) for name in names]
-    refusal = depth_refusal(plan)
-    if refusal and formats is not None and any(each.is_flown for each in chosen):
-        raise PlanError(refusal)
+    chosen = {name: format_named(name) for name in names}
+    flown = [name for name, each in chosen.items() if each.is_flown]
+    refusals = {name: why for name in flown if (why := depth_refusal(plan, name))}
+    if refusals and formats is not None:
+        raise PlanError(next(iter(refusals.values())))
     export = Export(plan=plan, rig=rig, options=options or Options())
     folder.mkdir(parents=True, exist_ok=True)
     files: dict[Path, str] = {}
-    for each in chosen:
-        if refusal and each.is_flown:
+    for name, each in chosen.items():
+        if name in refusals:
             _remove(folder, each)
         else:
             files |= each.write(folder, export)
     about = folder / "about.txt"
     files[about] = "what the files hold, and how"
     files[folder / SUMS] = "digests of the others, for sha256sum --check"
-    notes = _cola2(export, files, chosen=formats is not None) if "cola2" in names else []
-    notes += _ardusub(export) if {"wpl", "qgc"} & set(names) else []
-    if plan.is_flown_by_depth and not refusal:
+    written = set(names) - refusals.keys()
+    notes = _cola2(export, files, chosen=formats is not None) if "cola2" in written else []
+    notes += _ardusub(export) if {"wpl", "qgc"} & written else []
+    for refusal in dict.fromkeys(refusals.values()):
+        warn(f"missions are left out: {refusal}")
+        notes.append(f"Missions are left out: {refusal}.")
+    if plan.is_flown_by_depth and len(refusals) < len(flown):
         notes.append(
             "Missions keep depths, not an altitude: their least clearance over the bathymetry is "
             f"{plan.clearance_by_depth_m[0]:.2f} m. Check the tide, and the datum of the depths."
         )
-    if refusal:
-        warn(f"missions are left out: {refusal}")
-        notes = [f"Missions are left out: {refusal}."]
     _write_about(about, export, files, notes)
     _write_sums(folder, files)
     return files
@@ -118,9 +120,13 @@ def check_exported(mission: Path) -> None:
             )
 
 
-def depth_refusal(plan: Plan) -> str:
-    """Why no vehicle may fly a plan over its bathymetry; empty where one may."""
+def depth_refusal(plan: Plan, name: str) -> str:
+    """Why a plan may not be flown over its bathymetry in a format; empty where it may."""
     min_m, allowed_m = plan.clearance_by_depth_m
+    what = "between lines, missions for COLA2, WPL and QGroundControl would have"
+    if name == "cola2" and min_m >= allowed_m:
+        min_m = plan.cola2_clearance_m
+        what = "held off its lines by the expected current, a mission for COLA2 would have"
     if not plan.is_flown_by_depth or min_m >= allowed_m:
         return ""
     if not math.isfinite(allowed_m):
@@ -130,10 +136,9 @@ def depth_refusal(plan: Plan) -> str:
         )
     clearance = "an unknown clearance" if math.isnan(min_m) else f"{min_m:.2f} m of clearance"
     return (
-        f"between lines, missions for COLA2, WPL and QGroundControl would have {clearance} over "
-        f"the bathymetry, less than plan.least_clearance_m {allowed_m:g}: leave the steep part out "
-        "of the area, move plan.home_ne_m, or turn the lines along the slope "
-        "(plan.line_heading_deg)"
+        f"{what} {clearance} over the bathymetry, less than plan.least_clearance_m "
+        f"{allowed_m:g}: leave the steep part out of the area, move plan.home_ne_m, or turn the "
+        "lines along the slope (plan.line_heading_deg)"
     )
 
 

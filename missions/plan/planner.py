@@ -23,6 +23,7 @@ from missions.areas.bathymetry import Bathymetry, mean_depth_m, read_bathymetry
 from missions.areas.survey import survey_area
 from missions.coverage.certificate import Certificate, certificate
 from missions.coverage.stations import MAX_ALTITUDES, Stations, stations_of_plan, sure_pattern
+from missions.exports.follower import Follower, follower_of, off_lines_m
 from missions.exports.geometry import CameraMount
 from missions.exports.waypoints import min_clearance_by_depth, waypoints
 from missions.exposure.settings import ImagingSettings, ImagingSetup, imaging_settings
@@ -166,7 +167,8 @@ def plan_survey(config: SurveyConfig, rig: Rig, *, max_cells: int | None = None)
                 for dive in dives
             ]
             laid = replace(laid, way_depths_m=tuple(ways_m))
-            figures["by_depth"] = _by_depth(laid, plan, bathymetry, reach, config.camera)
+            follower = follower_of(config.vehicle, config.sea, plan.speed_mps)
+            figures["by_depth"] = _by_depth(laid, plan, bathymetry, reach, config.camera, follower)
         stations = _stations(laid, bathymetry)
         seen = certificate(area, rig, stations, pattern, max_cells=max_cells)
         if seen.share_at_overlap < _ENOUGH:
@@ -342,17 +344,23 @@ def _by_depth(
     bathymetry: Bathymetry,
     reach: terrain.Reach,
     camera: CameraConfig,
+    follower: Follower,
 ) -> dict[str, float | None]:
-    """How near the sea floor vehicles come that fly the way-points by depth."""
+    """How near the sea floor vehicles come that fly the way-points by depth, and COLA2's law."""
     rate_rad_s = turn_in_place_rate_rad_s(plan.turn_rate_limit_deg_s)
     mount = CameraMount(
         glass_body_m=camera.position_body_m, altimeter_body_m=camera.dvl_position_body_m
     )
     dives = [waypoints(laid, dive, mount, rate_rad_s, by_depth=True) for dive in laid.dives]
     steepest_rad = math.radians(plan.steepest_deg)
-    min_m = min_clearance_by_depth(laid, dives, bathymetry, reach, steepest_rad)
-    known_m = min_m if math.isfinite(min_m) else None
-    return {"min_clearance_m": known_m, "allowed_m": plan.least_clearance_m}
+    off_m = float(off_lines_m(follower, laid, mount.glass_body_m[0]).max(initial=0.0))
+    wider = replace(reach, aside_m=reach.aside_m + off_m)
+    found = {
+        name: min_clearance_by_depth(laid, dives, bathymetry, around, steepest_rad)
+        for name, around in (("min_clearance_m", reach), ("cola2_min_clearance_m", wider))
+    }
+    known = {name: min_m if math.isfinite(min_m) else None for name, min_m in found.items()}
+    return known | {"allowed_m": plan.least_clearance_m}
 
 
 def _stations(plan: Plan, bathymetry: Bathymetry | None) -> Stations:

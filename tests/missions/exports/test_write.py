@@ -1,5 +1,6 @@
 import csv
 import math
+import re
 import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
@@ -268,3 +269,17 @@ def test_floors_within_thirty_centimetres_are_flown_by_altitude(
     missions = [read_mission(file) for file in files if file.name.startswith("mission_")]
     heaves = {step.heave for mission in missions for step in mission.steps[1:-1]}
     assert heaves == {"depth" if by_depth else "altitude"}
+
+
+def test_cola2_alone_is_refused_where_a_current_holds_it_over_the_wall(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plan = plan_over(6.0)
+    by_depth = plan.details["terrain"]["by_depth"] | {"cola2_min_clearance_m": -4.0}
+    near = replace(plan, details={"terrain": plan.details["terrain"] | {"by_depth": by_depth}})
+    with pytest.raises(PlanError, match="COLA2"):
+        write_exports(tmp_path, near, RIG, formats=["cola2"])
+    write_exports(tmp_path, near, RIG)
+    assert len(re.findall("left out", capsys.readouterr().err)) == 1
+    kinds = {path.suffix for path in tmp_path.glob("mission_*")}
+    assert kinds == {".plan", ".waypoints"}
