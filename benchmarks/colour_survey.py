@@ -36,7 +36,7 @@ from alice_survey.sim.seafloor.light import (
     make_sensor,
     nominal_gain,
 )
-from alice_survey.sim.seafloor.renderer import Scene, flat_floor_radiance, range_map, render
+from alice_survey.sim.seafloor.renderer import Scene, flat_floor_radiance, render
 from alice_survey.sim.seafloor.terrain import Terrain, build_terrain
 from alice_survey.sim.seafloor.texture import SAND_ALBEDO, Texture, survey_texture
 from camera_calib.approximation.pinhole_warp import best_warp
@@ -47,6 +47,7 @@ from reconstruct.ply import VERTEX
 from reconstruct.raster import DemGrid, tiled_raster
 from reconstruct.views.model import WorldFrame, write_frame
 from reconstruct.views.model_files import colmap_pinhole, rigid3d
+from tests.cameras import range_map
 
 Floats = NDArray[np.float32]
 
@@ -199,10 +200,9 @@ def _take(task: tuple[Path, ColourSurvey, int]) -> None:
         return
     survey = _studio(asked)
     camera, (sensor, gain) = survey.rig.cameras["left"], survey.exposure
-    pose = survey.poses[number]
+    rng, pose = np.random.default_rng([SEED, 3, number]), survey.poses[number]
     seen = RigidTransform.from_matrix(pose.as_matrix()[None])
     radiance = render(survey.scene, camera, survey.light, seen, samples=2)
-    rng = np.random.default_rng([SEED, 3, number])
     path.parent.mkdir(parents=True, exist_ok=True)
     np.save(folder / f"range{number:04d}.npy", range_map(survey.scene, camera, pose))
     cv2.imwrite(str(path), develop(expose(radiance, sensor, rng), gain))

@@ -278,10 +278,9 @@ def _cola2(export: Export, files: Iterable[Path], *, chosen: bool) -> list[str]:
     exceeds |= follower.circle_m > 0.5 * plan.line_spacing_m
     if exceeds and (chosen or not follower.sways):
         towards_deg = math.degrees(math.atan2(*follower.current_ne_mps[::-1])) % 180.0
-        warn(
-            f"{expected}: lay lines along the current (line_heading_deg = {towards_deg:.0f}), wait "
-            "for less of it, or fly another autopilot's mission"
-        )
+        along = f"lay lines along the current (line_heading_deg = {towards_deg:.0f})"
+        calmer = f"{along}, wait for less of it, or " if follower.current_mps else ""
+        warn(f"{expected}: {calmer}fly another autopilot's mission")
     elif not follower.sways:
         note(expected)
     return [

@@ -1,5 +1,6 @@
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -50,10 +51,11 @@ def fit(
     start = level(points, np.stack([p.translation for p in poses]))
     lean = Rotation.from_euler("xy", [lean_deg, -lean_deg], degrees=True)
     arms = {name: scene.rig.body_from_cam(name) for name in scene.rig.cameras}
-    return fit_navigation(
+    found: Any = fit_navigation(
         records, poses, arms if levers else None, datum,
         replace(start, rotation=lean * start.rotation), known_scale=truth.scale if known else None,
     )  # fmt: skip
+    return found
 
 
 def tilt_deg(found: Similarity, truth: Similarity) -> float:
