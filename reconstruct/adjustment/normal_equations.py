@@ -353,7 +353,9 @@ def _reduce(
 ) -> None:  # fmt: skip
     """Add what some points say, in place, of `shared` below its diagonal."""
     points, count = starts.shape[0] - 1, rest.shape[2]
-    longest = np.max(np.diff(starts)) if points else 0
+    longest = np.int64(0)
+    for p in range(points):
+        longest = max(longest, starts[p + 1] - starts[p])
     pose = np.empty((longest, 2, 6))
     cross, gain = np.empty((longest, 6, 3)), np.empty((longest, 6, 3))
     together, solved = np.empty((3, count)), np.empty((3, count))
@@ -452,7 +454,9 @@ def _point_covariances(
 ) -> Array:  # fmt: skip
     points = starts.shape[0] - 1
     found = inverse.copy()
-    longest = np.max(np.diff(starts)) if points else 0
+    longest = np.int64(0)
+    for p in range(points):
+        longest = max(longest, starts[p + 1] - starts[p])
     follow, pose = np.empty((longest, 3, 6)), np.empty((2, 6))
     for p in range(points):
         first, end = starts[p], starts[p + 1]
