@@ -352,7 +352,7 @@ def test_pictures_of_another_import_are_not_replaced(tmp_path: Path) -> None:
     dives = [tmp_path / "d1", tmp_path / "d2"]
     for dive in dives:
         import_images(dive, [other])
-    with pytest.raises(WorkspaceError, match="-w"):
+    with pytest.raises(WorkspaceError, match="another workspace"):
         join_dives(work, dives)
     for _ in range(2):
         join_dives(tmp_path / "both", dives)
