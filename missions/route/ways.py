@@ -93,7 +93,8 @@ class Ways:
         if self._convex:
             return self.inside(starts_ne) & self.inside(ends_ne)
         _, edges, boxes = self._edges
-        met = _crossings(starts_ne, ends_ne, edges, boxes)
+        both = (np.array(places, np.float64, order="C") for places in (starts_ne, ends_ne))
+        met = _crossings(*both, edges, boxes)
         unsure = met == _UNSURE
         free: NDArray[np.bool_] = met == _NONE
         free[free] = self.inside(starts_ne[free])
