@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from alice_survey.core.frames import Array
 from alice_survey.core.run import progress
 from alice_survey.kit.document import Level, Verdict, worst_first
-from alice_survey.kit.words import with_sigma
+from alice_survey.kit.words import count, with_sigma
 from camera_calib.calibration import Calibration
 from camera_calib.judge import residuals, uncertainty, validation
 from camera_calib.optics import likely_port
@@ -202,7 +202,8 @@ def _fit_verdicts(judged: Judgement) -> Iterator[Verdict]:
     score = judged.hold_out
     harmless = score is not None and score.rms_px <= _HELD_OUT_LIMITS[0] * score.expected_px
     listed = ", ".join(f"view {p.view} of {p.camera} ({p.rms_px:.3f} px)" for p in odd[:5])
-    text = f"{len(odd)} pictures over {_ODD_PICTURE:g} times the median of {median:.3f} px rms"
+    pictures = count(len(odd), "picture")
+    text = f"{pictures} over {_ODD_PICTURE:g} times the median of {median:.3f} px rms"
     if odd and not harmless:
         yield _look(f"{text}, such as {listed}; look at them for blur, motion or a bent target")
     else:
