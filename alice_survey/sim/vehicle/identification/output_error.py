@@ -60,6 +60,11 @@ _MIN_STRETCHES, _MAX_STRETCHES = 10, 20
 """Stretches that logs are cut into: few are long, many show the spread better."""
 _WINDOWS = 4
 """Windows in a stretch where there are many."""
+_OF_FORCES = (term.LINEAR, *QUADRATICS, term.ADDED_MASS, term.LIFT, term.GAIN, term.BUOYANCY)
+"""Kinds of parameters that a motion's force is made of, but for what differs from day to day."""
+_CONFIRMED = 1.0
+"""Sigmas by which the fit must predict a stretch that was left out better than its start does:
+with one, five of six are."""
 _MIN_JUDGED = 5
 """With fewer stretches the spread is not known."""
 
@@ -101,40 +106,49 @@ def stretch_numbers(times_s: list[Array]) -> list[NDArray[np.intp]]:
     """
     spans = np.array([float(time_s[-1] - time_s[0]) for time_s in times_s])
     target = min(max(len(spans) // _WINDOWS, _MIN_STRETCHES), _MAX_STRETCHES)
-    length_s, ends = spans.sum() / target, np.cumsum(spans)
-    numbers: list[NDArray[np.intp]] = []
-    if len(spans) < _MIN_JUDGED:
-        for time_s, end_s in zip(times_s, ends.tolist(), strict=True):
-            passed = end_s - (time_s[-1] - time_s)
-            numbers.append(np.minimum(passed / length_s, target - 1).astype(np.intp))
-    else:
-        middles = (ends - 0.5 * spans) / length_s
-        places = np.minimum(middles, target - 1).astype(np.intp)
-        _, places = np.unique(places, return_inverse=True)
-        numbers = [np.full(len(t), k) for t, k in zip(times_s, places.tolist(), strict=True)]
-    return numbers
+    ends = np.cumsum(spans)
+    passed = [end_s + t - t[-1] for end_s, t in zip(ends.tolist(), times_s, strict=True)]
+    if len(spans) >= _MIN_JUDGED:
+        passed = [np.full(len(part), 0.5 * (part[0] + part[-1])) for part in passed]
+    places = np.minimum(np.concatenate(passed) * target / ends[-1], target - 1).astype(np.intp)
+    number = np.unique(places, return_inverse=True)[1]
+    return np.split(number, np.cumsum([len(part) for part in passed])[:-1])
 
 
 def jackknife_covariance(stretches: Stretches, prior: Array) -> Array | None:
     """Covariance, (P, P), of parameters as far as the logs' noise makes it; None of few stretches.
 
+    Errors of a model last longer than a stretch: neighbours are joined, two by two, and the
+    largest variance counts (blocking: H. Flyvbjerg & H. G. Petersen, J. Chem. Phys. 91, 1989).
+
     Args:
         stretches: at the fit.
         prior: (P, P) information that is not of the logs and stays when a stretch is left out.
     """
-    count = len(stretches)
-    if count < _MIN_JUDGED:
-        return None
+    found: list[Array] = []
+    while (count := len(stretches)) >= _MIN_JUDGED:
+        moves = moves_without(stretches, prior)
+        # Errors by a spread of few are spread as Student's t, with a variance of n / (n - 2).
+        student = (count - 1.0) / (count - 3.0)
+        found.append(student * (count - 1.0) / count * (moves.T @ moves))
+        joined, firsts = np.add.reduceat, np.arange(0, count, 2)
+        scores, information = joined(stretches.scores, firsts), stretches.information
+        stretches = Stretches(scores=scores, information=joined(information, firsts))
+    return _widened(found[0], found) if found else None
+
+
+def _widened(covariance: Array, others: Sequence[Array]) -> Array:
+    """A covariance with its correlations, and variances no smaller than those of others."""
+    variance = np.max([np.diag(covariance), *map(np.diag, others)], axis=0)
+    factor = np.sqrt(variance / np.diag(covariance))
+    return np.asarray(covariance * np.outer(factor, factor))
+
+
+def moves_without(stretches: Stretches, prior: Array) -> Array:
+    """Gauss-Newton steps, (B, P), of the parameters as each stretch is left out."""
     total = stretches.information.sum(axis=0) + prior
-    moves = np.array(
-        [
-            np.linalg.solve(total - information, score - stretches.scores.mean(axis=0))
-            for score, information in zip(stretches.scores, stretches.information, strict=True)
-        ]
-    )
-    # Errors by a spread of few are spread as Student's t, with a variance of n / (n - 2).
-    student = (count - 1.0) / (count - 3.0)
-    return np.asarray(student * (count - 1.0) / count * (moves.T @ moves))
+    scores = stretches.scores - stretches.scores.mean(axis=0)
+    return np.linalg.solve(total - stretches.information, scores[..., None])[..., 0]
 
 
 def design_effect(stretches: Stretches, prior: Array) -> float:
@@ -306,12 +320,13 @@ class OutputErrorFit:
     """(P, P) the part that comes of the start's own error; zero without a prior."""
     at_bound: Mask
     """(P,) bool: held by a bound, so without sigma."""
+    at_start: Mask
+    """(P,) bool: left at the start, as stretches that were left out do not confirm the fit; the
+    sigma holds the distance to where the logs had them."""
+    closer: Array
+    """(2, 9) shares by which the fit is closer to such stretches than the start; see `closer`."""
     channel_sigma: Array
     """(9,) sigmas of the residuals, NaN where nothing was measured."""
-    windows: Sequence[Window]
-    starts: Sequence[Array]
-    """(10,) state each window begins with, nu relative to the water."""
-    samples: int
     prior: PriorSigmas | None = None
     """As it was given."""
 
@@ -403,10 +418,7 @@ class _FitProblem:
         self.prior, self.prior_weight = prior, 1.0
         self.sigma = np.maximum(np.where(np.isfinite(sigma), sigma, 1.0), _MIN_SIGMA)
         self.count = len(parameters.names)
-        self.measured = [
-            np.isfinite(residual_channels(w, _blank(w))) & np.ones(term.CHANNELS, bool)
-            for w in windows
-        ]
+        self.measured = [np.isfinite(residual_channels(w, _blank(w))) for w in windows]
         # Starts of the parameters whose slopes were last requested: a trial nearby begins there, so
         # that it comes back to the same residuals as its step goes to nothing.
         self.samples = sum(int(mask.sum()) for mask in self.measured)
@@ -414,6 +426,13 @@ class _FitProblem:
         blank = np.full(term.START, term.CHANNELS)
         places = [np.concatenate([np.nonzero(mask)[1], blank]) for mask in self.measured]
         self.channel = np.concatenate(places)
+        # Its stretch, too; those of starts are with their window.
+        numbers = stretch_numbers([window.record.time_s for window in windows])
+        parts = [
+            np.concatenate([number[np.nonzero(mask)[0]], np.full(term.START, number[0])])
+            for number, mask in zip(numbers, self.measured, strict=True)
+        ]
+        self.number = np.concatenate(parts)
         self.starts = [window.start.copy() for window in windows]
         self.gains = [np.zeros((term.START, self.count)) for _ in windows]
         self.at = parameters.start.copy()
@@ -483,23 +502,57 @@ class _FitProblem:
         information = table[:, free].T @ table[:, free]
         inverse = _inverse(information, [self.parameters.names[k] for k in free])
         held = self._prior_information(values)[np.ix_(free, free)]
-        scattered = jackknife_covariance(self._stretches(residuals, table[:, free]), held)
+        stretches = self._stretches(residuals, table[:, free])
+        scattered = jackknife_covariance(stretches, held)
         # By chance it may come out below that of white noise: this is not used.
         from_logs = inverse @ (information - held) @ inverse
         if scattered is not None:
-            minimum = np.sqrt(np.maximum(np.diag(from_logs) / np.diag(scattered), 1.0))
-            from_logs = scattered * np.outer(minimum, minimum)
+            from_logs = _widened(scattered, [from_logs])
         # The start is off by its own sigma: a score of weight times that of the prior alone.
         from_prior = self.prior_weight * inverse @ held @ inverse
-        tables = [np.zeros((self.count, self.count)) for _ in range(2)]
-        for whole, part in zip(tables, (from_logs, from_prior), strict=True):
-            whole[np.ix_(free, free)] = part
+        whole = np.eye(self.count)[:, free]
+        from_logs, from_prior = (whole @ part @ whole.T for part in (from_logs, from_prior))
+        # Forces whose motions are not predicted better for sure are left as they were.
+        shares, start = self._closer(residuals, table[:, free], held), self.parameters.start
+        places = [place_of(name) for name in self.parameters.names]
+        known = [kind in _OF_FORCES for kind, _, _ in places]
+        forces = [2 if kind == term.BUOYANCY else force for kind, force, _ in places]
+        at_start = np.array(known, bool) & (shares[0] < _CONFIRMED * shares[1])[forces]
+        away = np.where(at_start, values - start, 0.0)
         return OutputErrorFit(
-            parameters=self.parameters, values=values, covariance=tables[0] + tables[1],
-            prior_covariance=tables[1], at_bound=at_bound,
+            parameters=self.parameters, values=values - away,
+            covariance=from_logs + from_prior + np.outer(away, away),
+            prior_covariance=from_prior, at_bound=at_bound & ~at_start, at_start=at_start,
+            closer=shares,
             channel_sigma=self._channel_sigma(residuals) * self.sigma,
-            windows=self.windows, starts=list(self.starts), samples=self.samples,
         )  # fmt: skip
+
+    def _closer(self, residuals: Array, table: Array, prior: Array) -> Array:
+        """Judge the fit against its start, by stretches that are left out of the fit.
+
+        Of the distance between the two predictions of a stretch, a share of -1 to 1 is what one is
+        closer to the log than the other. Stretches count by that distance: at rest they do not.
+
+        Returns:
+            (2, 9) mean share of each channel, and its standard deviation from stretch to stretch.
+        """
+        rows, width, stretches = (
+            len(self.number),
+            term.CHANNELS + 1,
+            self._stretches(residuals, table),
+        )
+        if self.prior is None or len(stretches) < _MIN_JUDGED:
+            return np.full((2, term.CHANNELS), np.nan)
+        moves = moves_without(stretches, prior)[self.number]
+        found = residuals[:rows] + np.sum(table[:rows] * moves, axis=1)
+        begun = self.residuals(self.parameters.start)[:rows]
+        place, size = self.number * width + self.channel, len(stretches) * width
+        squares = (np.bincount(place, x**2, size) for x in (begun, found, begun - found))
+        b, f, apart = (np.sqrt(x).reshape(-1, width)[:, :-1] for x in squares)
+        with np.errstate(invalid="ignore"):
+            weight, share = apart / apart.sum(axis=0), (b - f) / np.maximum(apart, _NOTHING)
+            mean = np.sum(weight * share, axis=0)
+            return np.stack([mean, np.sqrt(np.sum(weight * (share - mean) ** 2, axis=0))])
 
     def weigh_prior(self, values: Array) -> float:
         """Let the prior count as the logs' residuals are correlated; return its relative change."""
@@ -518,14 +571,9 @@ class _FitProblem:
         return np.diag(self.prior_weight * self.prior.slopes(values) ** 2)
 
     def _stretches(self, residuals: Array, table: Array) -> Stretches:
-        """Residuals and slopes by stretches of the logs; priors of starts with their window."""
-        numbers = stretch_numbers([window.record.time_s for window in self.windows])
-        rows = [
-            np.concatenate([number[np.nonzero(mask)[0]], np.full(term.START, number[0])])
-            for number, mask in zip(numbers, self.measured, strict=True)
-        ]
-        number = np.concatenate(rows)
-        return in_stretches(residuals[: len(number)], table[: len(number)], number)
+        """Residuals and slopes by stretches of the logs."""
+        count = len(self.number)
+        return in_stretches(residuals[:count], table[:count], self.number)
 
     def _solve(self, values: Array) -> list[tuple[Array, Array, Array]] | None:
         """Starts, residuals in sigmas and slopes, by window; None where there are none."""
@@ -537,8 +585,7 @@ class _FitProblem:
         for i, window in enumerate(self.windows):
             start = _move_start(self.starts[i], -self.gains[i] @ (values - self.at))
             found = self._start(window, i, physics, start)
-            if found is None:
-                found = self._start(window, i, physics, window.start)
+            found = found or self._start(window, i, physics, window.start)
             if found is None:
                 return None
             solved.append(found)
@@ -604,14 +651,10 @@ class _FitProblem:
 def _first_sigma(windows: Sequence[Window]) -> Array:
     """First sigma of each channel, (9,): the noise, or a share of the spread if larger."""
     sigma = np.full(term.CHANNELS, np.nan)
-    attitude = [np.unwrap(_known_rows(attitude_of(w.record.attitude)), axis=0) for w in windows]
+    all_read = [np.hstack([w.measured, attitude_of(w.record.attitude)]) for w in windows]
     for channel in range(term.CHANNELS):
-        table = (
-            [w.measured[:, channel] for w in windows]
-            if channel < 6
-            else [a[:, channel - 6] for a in attitude]
-        )
-        table = [series[np.isfinite(series)] for series in table]
+        table = [read[np.isfinite(read[:, channel]), channel] for read in all_read]
+        table = [np.unwrap(series) for series in table] if channel >= 6 else table
         found = [noise_sigma(series) for series in table if len(series) >= 5]
         if found:
             spread = float(np.std(np.concatenate(table)))
@@ -632,10 +675,6 @@ def noise_sigma(series: Array) -> float:
     """
     second = np.diff(series, 2) / np.sqrt(_SECOND_DIFFERENCE)
     return float(_MAD * np.median(np.abs(second)))
-
-
-def _known_rows(angles: Array) -> Array:
-    return angles[np.all(np.isfinite(angles), axis=1)]
 
 
 def _blank(window: Window) -> Array:

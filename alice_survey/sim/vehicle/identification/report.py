@@ -365,6 +365,7 @@ def _row(found: OutputErrorFit | TwoStep, k: int) -> dict[str, Any]:
     if isinstance(found, OutputErrorFit):
         prior = found.prior_covariance[k, k]
         remarks += ["at a bound"] if found.at_bound[k] else []
+        remarks += ["left at its start"] if found.at_start[k] else []
         remarks += ["held by the prior"] if 2.0 * prior > found.covariance[k, k] else []
     return {
         "start": start,
@@ -384,10 +385,12 @@ def _fit_data(fit: OutputErrorFit) -> dict[str, Any]:
         for i, j in itertools.combinations(range(len(names)), 2)
         if math.isfinite(matrix[i, j]) and abs(matrix[i, j]) > _HIGH_CORRELATION
     ]
-    sigma = map(_or_none, fit.channel_sigma)
+    sigma, shares = map(_or_none, fit.channel_sigma), 100.0 * fit.closer[:, :_MOTIONS]
     return {
         "high_correlations": sorted(pairs, key=lambda pair: -abs(pair["correlation"])),
         "residual_sigma": dict(zip(CHANNEL_NAMES, sigma, strict=True)),
+        "closer_percent": _motions(shares[0]),
+        "closer_percent_sigma": _motions(shares[1]),
         "prior": None if fit.prior is None else asdict(fit.prior),
         "covariance": fit.covariance.tolist(),
     }

@@ -239,7 +239,8 @@ def test_errors_are_as_large_as_they_are_said_to_be(decay: float) -> None:
         white.append(error / np.sqrt(np.diag(inverse)))
         effects.append(output_error.design_effect(stretches, NOTHING))
     rms, rms_white = (np.sqrt(np.mean(np.square(z))) for z in (scores, white))
-    assert 0.85 < rms < 1.25
+    # The largest of two spreads: on the wide side.
+    assert 0.7 < rms < 1.05
     # A process with this memory counts (1 + a) / (1 - a) times in its mean.
     counts = (1 + decay) / (1 - decay)
     assert rms_white**2 == pytest.approx(counts, rel=0.25)
