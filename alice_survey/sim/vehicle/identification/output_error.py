@@ -134,10 +134,10 @@ def jackknife_covariance(stretches: Stretches, prior: Array) -> Array | None:
         joined, firsts = np.add.reduceat, np.arange(0, count, 2)
         scores, information = joined(stretches.scores, firsts), stretches.information
         stretches = Stretches(scores=scores, information=joined(information, firsts))
-    return _widened(found[0], found) if found else None
+    return _widen(found[0], found) if found else None
 
 
-def _widened(covariance: Array, others: Sequence[Array]) -> Array:
+def _widen(covariance: Array, others: Sequence[Array]) -> Array:
     """A covariance with its correlations, and variances no smaller than those of others."""
     variance = np.max([np.diag(covariance), *map(np.diag, others)], axis=0)
     factor = np.sqrt(variance / np.diag(covariance))
@@ -507,7 +507,7 @@ class _FitProblem:
         # By chance it may come out below that of white noise: this is not used.
         from_logs = inverse @ (information - held) @ inverse
         if scattered is not None:
-            from_logs = _widened(scattered, [from_logs])
+            from_logs = _widen(scattered, [from_logs])
         # The start is off by its own sigma: a score of weight times that of the prior alone.
         from_prior = self.prior_weight * inverse @ held @ inverse
         whole = np.eye(self.count)[:, free]

@@ -134,8 +134,9 @@ def test_wrong_names_are_refused(names: tuple[str, ...], named: str) -> None:
 
 
 @pytest.mark.slow
-def test_where_a_log_says_little_the_start_is_kept_and_where_much_the_log() -> None:
+def test_the_start_counts_where_a_log_says_little(monkeypatch: pytest.MonkeyPatch) -> None:
     """In 10 s of noise, linear and quadratic drag look alike: the log alone splits them badly."""
+    monkeypatch.setattr(output_error, "_CONFIRMED", -math.inf)  # the prior by itself
     truth = {"X_uu": -12.0, "X_u": -3.0, "N_rr": -70.0}
     start = {"X_uu": -14.0, "X_u": -4.0}
     flown = fly(
