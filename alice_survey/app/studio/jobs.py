@@ -456,9 +456,7 @@ class Jobs:
 
     def _check_free(self) -> None:
         if self._job is not None:
-            raise BusyError(
-                f"'{self._job.record.command}' is working here: wait for it, or stop it first"
-            )
+            raise BusyError(f"'{self._job.record.command}' is working here: wait for it or stop it")
         until_s = time.monotonic() + _LOCK_S
         while is_locked(self._workspace):
             if time.monotonic() > until_s:

@@ -49,9 +49,7 @@ try:
 except ImportError as missing:
     from alice_survey.core.errors import WorkspaceError, extra
 
-    raise WorkspaceError(
-        f"the studio needs {missing.name}, which is not installed: {extra('studio')}"
-    ) from None
+    raise WorkspaceError(f"the studio needs {missing.name}: {extra('studio')}") from None
 
 from alice_survey.app.studio import endpoints
 from alice_survey.app.studio.endpoints.base import Call, Content, Endpoint, Studio, json_text
@@ -377,9 +375,7 @@ class Server:
         try:
             self.socket = socket.create_server((ADDRESS, port), backlog=128)
         except OSError as error:
-            raise WorkspaceError(
-                f"port {port} of {ADDRESS}: {why(error)}: give another --port, or none"
-            ) from None
+            raise WorkspaceError(f"port {port}: {why(error)}: give another, or no --port") from None
         self.port: int = self.socket.getsockname()[1]
         self._uvicorn = uvicorn.Server(
             uvicorn.Config(

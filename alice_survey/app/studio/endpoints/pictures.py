@@ -315,8 +315,7 @@ class _Tab:
         size = model.pictures.warp(image).size_px
         if not (0 <= x_px <= size[0] and 0 <= y_px <= size[1]):
             raise ReconstructionError(
-                f"{image}: {x_px - 0.5:g}, {y_px - 0.5:g} is outside of its {size[0]} x {size[1]} "
-                "pixels"
+                f"{image}: {x_px - 0.5:g}, {y_px - 0.5:g} is outside its {size[0]} x {size[1]} px"
             )
         start, way = model.pictures.picture(image).ray(np.array([x_px, y_px]))
         if not np.isfinite(start + way).all():
