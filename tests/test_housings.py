@@ -46,14 +46,15 @@ def surveyed(
     return json.loads((workspace / "evaluation" / "score.json").read_text())
 
 
-def check(score: dict[str, Any], length_m: float, width_m: float) -> None:
+def check(
+    score: dict[str, Any], length_m: float, width_m: float, over_sigma: tuple[float, float]
+) -> None:
     """0.3 mm for cameras and 0.5 mm for the surface, in ground pixels of the demonstration."""
     assert score["cameras"]["registered"] == score["cameras"]["total"] >= 20
     pixel_mm = score["surface"]["ground_pixel_mm"]
     assert 0.01 < score["cameras"]["rms_mm"] / pixel_mm < 0.17
     assert 0.05 < score["surface"]["distance_rms_mm"] / pixel_mm < 0.28
-    # Most of a sigma is the calibration's, of which a survey has one draw: seeds give 0.5 to 1.7.
-    assert 0.3 < score["surface"]["error_over_sigma"]["robust"] < 2.5
+    assert over_sigma[0] < score["surface"]["error_over_sigma"]["robust"] < over_sigma[1]
     assert abs(score["cameras"]["scale_error_ppm"]) < 400
     north_m, east_m, _ = score["cameras"]["georeference_north_east_down_m"]
     missed = abs(north_m) / length_m + abs(east_m) / width_m  # strips at the edges, by navigation
@@ -81,7 +82,7 @@ def pool_as(workspace: Path, output: Path, port: str | None, **more: Any) -> lis
 
 def test_a_dome_off_its_centre_is_surveyed_and_no_other_port_passes_for_it(tmp_path: Path) -> None:
     workspace = tmp_path / "dome"
-    check(surveyed(workspace, DOME, 2.6, 2.2, scale=4), 2.6, 2.2)
+    check(surveyed(workspace, DOME, 2.6, 2.2, scale=4), 2.6, 2.2, (0.8, 1.4))
     assert not pool_as(workspace, tmp_path / "air", None)
     start = {"start": tmp_path / "air" / "rig.json"}
     dome = {"dome_radius_mm": "80", **start}
@@ -95,4 +96,6 @@ def test_a_dome_off_its_centre_is_surveyed_and_no_other_port_passes_for_it(tmp_p
 
 
 def test_a_fisheye_of_120_degrees_is_surveyed(tmp_path: Path) -> None:
-    check(surveyed(tmp_path / "fisheye", FISHEYE, 3.6, 3.2, scale=6), 3.6, 3.2)
+    """Most of a sigma is the calibration's, which has one draw: three seeds give 0.48 to 1.74."""
+    score = surveyed(tmp_path / "fisheye", FISHEYE, 3.6, 3.2, scale=6)
+    check(score, 3.6, 3.2, (0.3, 2.5))

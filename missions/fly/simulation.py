@@ -621,8 +621,8 @@ def simulate_mission(
     known, vehicle = mission_of_settings(plan, settings), settings.vehicle
     flown_by = pilot_mission(known, vehicle, _mount(settings.camera))
     # Our own pilot holds places by sway where a vehicle has it, which the laws may ask for.
-    has_sideways = sways(gains_for(sound_vehicle(vehicle), plan.speed_mps))
-    own = vehicle.model_copy(update={"controller": "sway" if has_sideways else "los"})
+    has_sway = sways(gains_for(sound_vehicle(vehicle), plan.speed_mps))
+    own = vehicle.model_copy(update={"controller": "sway" if has_sway else "los"})
     own_settings, pictures = replace(settings, vehicle=own), partial(picture_times, known)
     flight = _simulate(known.plan, own_settings, floor, rng, label, flown_by, pictures)
     if known.mission.autopilot != "cola2":
@@ -945,7 +945,7 @@ def room_behind_m(plan: Plan, path: PilotPath, max_m: float) -> float:
     start = np.array([path.start_n[0], path.start_e[0]])
     course = float(path.heading_rad[0])
     end = start - max_m * np.array([math.cos(course), math.sin(course)])
-    inside = LineString([start, end]).intersection(plan.area.allowed.buffer(_TOUCH_M))
+    inside = LineString([start, end]).intersection(plan.area.touched)
     parts = [part for part in shapely.get_parts(inside) if part.distance(Point(start)) <= _TOUCH_M]
     return min(max_m, max((float(part.length) for part in parts), default=0.0))
 

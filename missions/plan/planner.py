@@ -389,11 +389,11 @@ def _warn_of_hull(
         warn(f"{vehicle.name} has no [hull]: distances to floor and zones are those of one point")
     if zones is not None and clearance_m < zones.reach_m:
         touching, ways = zones.touching(dives)
+        also = f", and for want of room on {touching} of {ways} ways between them" * bool(touching)
         warn(
-            f"lines keep the camera {clearance_m:g} m off the no-go zones, the hull reaches "
-            f"{zones.reach_m:.1f} m from it; for want of room it touches them on {touching} of "
-            f"{ways} ways between lines, too: raise area.no_go_clearance_m unless the zones have "
-            "room around what they keep off"
+            f"the hull reaches {zones.reach_m:.1f} m from the camera, which lines keep "
+            f"{clearance_m:g} m off the no-go zones: it is over them where lines pass{also}; raise "
+            "area.no_go_clearance_m unless the zones have room around what they keep off"
         )
 
 

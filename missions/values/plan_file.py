@@ -147,10 +147,8 @@ class Plan:
 
     @property
     def cola2_clearance_m(self) -> float:
-        """The least clearance where COLA2's law holds a vehicle off its lines, if it is noted."""
-        known = (self.details.get("terrain") or {}).get("by_depth") or {}
-        noted = "cola2_min_clearance_m" in known
-        return self._terrain("by_depth", "cola2_" * noted + "min_clearance_m")
+        """The least clearance where COLA2's law holds a vehicle off its lines; NaN: not known."""
+        return self._terrain("by_depth", "cola2_min_clearance_m")
 
     def _terrain(self, part: str, name: str) -> float:
         known = (self.details.get("terrain") or {}).get(part) or {}

@@ -86,7 +86,7 @@ class StudioCommand(WorkspaceCommand):
 class _Grouped(TyperGroup):
     """Commands below the headings of `GROUPS`."""
 
-    def format_commands(self, ctx: typer.Context, formatter: Any) -> None:  # type: ignore[override]
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write the lists of commands."""
         for heading, names in GROUPS.items():
             with formatter.section(heading):

@@ -108,7 +108,7 @@ def _fence(export: Export, *, first: bool) -> list[dict[str, Any]]:
         warn(
             f"lines bring the vehicle's reference point, {export.mount.reach_m:.2f} m from the "
             f"glass, over {crossed} of {len(zones)} no-go zones: the fence leaves it the way, and "
-            f"leaves out {lost} of them; raise area.no_go_clearance_m to keep all"
+            f"leaves out {lost or 'none'} of them; raise area.no_go_clearance_m to keep them whole"
         )
     return fences
 

@@ -172,7 +172,8 @@ def plan_over(wall_m: float, slope: float = 0.0, made: Callable[..., Plan] = sma
     dives = [waypoints(plan, dive, mount, 0.3, by_depth=True) for dive in plan.dives]
     min_m = min_clearance_by_depth(plan, dives, floor, REACH, STEEPEST_RAD)
     figures = terrain_figures(profiles, limits, relief_m=10.0)
-    figures["by_depth"] = {"min_clearance_m": min_m, "allowed_m": 1.0}
+    figures["by_depth"] = dict.fromkeys(("min_clearance_m", "cola2_min_clearance_m"), min_m)
+    figures["by_depth"]["allowed_m"] = 1.0
     return replace(plan, details={"terrain": figures})
 
 

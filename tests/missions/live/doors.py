@@ -65,7 +65,7 @@ class Nodes:
 
 
 class Submarine:
-    """A pilot over MAVLink, and its submarine, which surfaces by itself when told to."""
+    """A pilot over MAVLink, and its submarine, which surfaces by itself when asked to."""
 
     def __init__(self, mission: LiveMission, vehicle: SimulatedVehicle, pass_on: PassOn) -> None:
         self.vehicle, self.pass_on, self.loops = vehicle, pass_on, InnerLoops(vehicle)

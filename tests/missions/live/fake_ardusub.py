@@ -2,7 +2,7 @@
 
 Its dynamics are the simulator's; loops of its own turn velocity and heading into a wrench. It goes
 on when the set-point of a tick has come, and ends when none comes any more at the surface, or when
-it is told to surface. With a fault, "nan" or "frozen", its position is so from `FAULT_S` on.
+it is asked to surface. With a fault, "nan" or "frozen", its position is so from `FAULT_S` on.
 """
 
 import math
