@@ -82,7 +82,7 @@ def test_every_stage_is_reported(small_survey: Path) -> None:
     assert begun == ended and len(begun) > 20
     for event in run:
         if event["event"] == "step_finished":
-            assert event["complete"]
+            assert event["complete"], event
             assert event.get("done", 0) <= event.get("total", event.get("done", 0))
 
 

@@ -120,6 +120,19 @@ def test_time_left_to_compile_goes_by_the_kernels_compiled_so_far(
     assert [event["done"] for event in kept.named("step_finished")] == [20]
 
 
+def test_a_stage_that_ends_well_ends_the_compiling_with_it_but_no_step_left_open(
+    run: Run, kept: Kept, clock: Clock
+) -> None:
+    with run.stage("plan", "planning") as report:
+        run.watch_kernels("plan", {"one": 1.0, "two": 1.0})
+        clock.now_s += 1.0
+        run.watch_kernels("plan", {"two": 1.0})
+        run.begin_step("left by its consumer", 3)
+        report(took_s=1.0)
+    ends = {event["step"]: event["complete"] for event in kept.named("step_finished")}
+    assert sorted(ends.values()) == [False, True] and not ends["left by its consumer"]
+
+
 def test_more_items_than_expected_and_none_leave_their_number_open(run: Run, kept: Kept) -> None:
     with progress.step("fly", 2) as counter:
         counter.advance(2)

@@ -192,8 +192,8 @@ class Run:
             complete = True
         finally:
             with self._lock:
-                for step in list(self._steps):  # of generators that nobody went on with
-                    self.end_step(step, complete=False)
+                for step in list(self._steps):  # of abandoned generators, or compiling
+                    self.end_step(step, complete=complete and step is self._compiling)
                 if complete:
                     self.report("stage_finished", elapsed_s=task.elapsed, **last)
                 self._stages.pop()

@@ -77,7 +77,8 @@ def test_any_edit_gives_the_same_bytes_each_time_or_one_line(edit: Any, drawn: A
         assert "#" not in line or line.rsplit("#", 1)[1] in draft.text
 
 
-@settings(max_examples=12, deadline=None)
+@pytest.mark.slow  # a drawing of crossing corridors takes ten times as long as the usual one
+@settings(max_examples=24, deadline=None)
 @given(edit=changes(), drawn=shapes())
 def test_any_edit_is_planned_or_refused_in_one_line(
     tmp_path_factory: pytest.TempPathFactory, edit: Any, drawn: Any
