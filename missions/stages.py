@@ -146,7 +146,7 @@ FLY = StageSpec(
     folder="flight",
     command="fly",
     about="the plan flown by a simulated vehicle",
-    version=8,
+    version=9,
     work="missions.fly.run:run_fly",
     takes=(
         "seed",

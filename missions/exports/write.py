@@ -281,7 +281,7 @@ def _cola2(export: Export, files: Iterable[Path], *, chosen: bool) -> list[str]:
         along = f"lay lines along the current (line_heading_deg = {towards_deg:.0f})"
         calmer = f"{along}, wait for less of it, or " if follower.current_mps else ""
         warn(f"{expected}: {calmer}fly another autopilot's mission")
-    elif not follower.sways:
+    elif chosen or not follower.sways:
         note(expected)
     return [
         "COLA2 pilot parameters:",

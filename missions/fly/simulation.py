@@ -187,6 +187,8 @@ def simulate_plan(
     floor: FloorGrid,
     rng: np.random.Generator,
     label: str = "flight",
+    mission: PilotMission = NO_MISSION,
+    pictures: "PictureTimes" = trigger_times,
 ) -> Flight:
     """Fly a plan.
 
@@ -196,23 +198,13 @@ def simulate_plan(
         floor: the true sea floor.
         rng: source of all noise.
         label: what the progress bar says; there is none if it is empty.
+        mission: flown in place of the plan's route.
+        pictures: when they are taken.
 
     Raises:
         VehicleError: a setting does not fit the vehicle, or it cannot fly the plan's sway steps.
         NavigationError: the file of the current cannot be read.
     """
-    return _simulate(plan, settings, floor, rng, label)
-
-
-def _simulate(
-    plan: Plan,
-    settings: FlightSettings,
-    floor: FloorGrid,
-    rng: np.random.Generator,
-    label: str,
-    mission: PilotMission = NO_MISSION,
-    pictures: "PictureTimes" = trigger_times,
-) -> Flight:
     max_s = max_mission_s(plan)
     setup = mission_setup(plan, settings, floor, max_s, rng, mission)
     ascent_s = plan.seafloor_depth_m / _CLIMB_MPS
@@ -252,7 +244,8 @@ def piloting_of(
             f"above {diverging_mps:.2f} m/s and is badly damped at the plan's {plan.speed_mps:g} "
             "m/s: lower the speed"
         )
-    steepest_rad = math.radians(settings.plan.steepest_deg)
+    # A vehicle that hovers climbs upright at the ends of its lines, which keep to the slope anyway.
+    steepest_rad = math.radians(settings.plan.steepest_deg if vehicle.fins else 89.9)
     path = path_of(plan, settings.camera.position_body_m[2], steepest_rad)
     turns = int(np.count_nonzero(path.turn_rad))
     if turns and mission.law == NO_LAW and settings.vehicle.controller == "los":
@@ -624,7 +617,7 @@ def simulate_mission(
     has_sway = sways(gains_for(sound_vehicle(vehicle), plan.speed_mps))
     own = vehicle.model_copy(update={"controller": "sway" if has_sway else "los"})
     own_settings, pictures = replace(settings, vehicle=own), partial(picture_times, known)
-    flight = _simulate(known.plan, own_settings, floor, rng, label, flown_by, pictures)
+    flight = simulate_plan(known.plan, own_settings, floor, rng, label, flown_by, pictures)
     if known.mission.autopilot != "cola2":
         return flight
     follower = follower_of(vehicle, settings.sea, plan.speed_mps)

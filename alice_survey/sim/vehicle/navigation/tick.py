@@ -58,6 +58,9 @@ _MIN_SPREAD = 0.01
 three corners."""
 _RELIEF_MEMORY_S = 10.0
 """Time over which the beams' spread is averaged; their own footprint at survey speed."""
+_MAX_RELIEF_M = 0.35
+"""How far the sea floor may lie above the highest end of a beam, and the sigma of it: what strays
+more is a wall, whose top an end meets."""
 
 
 @kernel
@@ -247,7 +250,9 @@ def _hear_floor(time_s: float, used: int, nav: NavigationState, suite: Sensors) 
         n, e, d = rotate(turned, a, b, c)
         clearance = min(clearance, altitude + north * n + east * e - d)
         lowest = max(lowest, d)
-    memory[slot.CLEARANCE_PING] = min(clearance, highest - lowest)
+    ends = highest - lowest
+    clearance = min(ends, max(clearance, ends - _MAX_RELIEF_M))
+    memory[slot.CLEARANCE_PING] = clearance - math.sqrt(min(spread, _MAX_RELIEF_M**2) + tilt)
 
 
 @kernel
@@ -306,7 +311,7 @@ def _write_estimate(time_s: float, nav: NavigationState, suite: Sensors, estimat
         memory[slot.ALTITUDE_NOW] = memory[slot.ALTITUDE_PING] - gained + sinks
         memory[slot.ALTITUDE_SIGMA] = math.sqrt(memory[slot.ALTITUDE_VARIANCE] + drifted)
         clearance = memory[slot.CLEARANCE_PING] - gained + min(sinks, 0.0)
-        memory[slot.CLEARANCE_NOW] = clearance - memory[slot.ALTITUDE_SIGMA]
+        memory[slot.CLEARANCE_NOW] = clearance - math.sqrt(drifted)
     else:
         memory[slot.ALTITUDE_NOW] = memory[slot.ALTITUDE_SIGMA] = memory[slot.CLEARANCE_NOW] = (
             math.nan

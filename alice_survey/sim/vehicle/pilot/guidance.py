@@ -152,6 +152,9 @@ def follow(leg: int, along: float, tick: Tick) -> None:
 _DEPTH_SPEED_KEPT_MPS = 0.05
 _CAUTION_M = 0.5
 """A dive without bottom lock stops at least this far above the greatest depth."""
+_AHEAD_M, _OFF_M = 0.4, 0.3
+"""Over a known sea floor: how far ahead a hovering vehicle looks, about its way to stop, and from
+how far off its depth on it goes slower, to stand at twice that."""
 _MEAN_S = 12.0
 """Swings are averaged over about this time, and must be about the goal for as long: longer than the
 period of a long swell."""
@@ -269,17 +272,19 @@ def _target_m(path: Path, guidance: Guidance, pilot: PilotState) -> float:
     Never deeper than planned: over a known sea floor a plan climbs ahead of what is higher.
     """
     at_m, planned_m = path.profile_at_m, math.inf
-    place = path.begins_m[int(pilot.report[slot.LEG])] + pilot.report[slot.ALONG]
-    low, high = 0, at_m.shape[0] - 1
-    while high - low > 1:
-        middle = (low + high) // 2
-        if at_m[middle] <= place:
-            low = middle
-        else:
-            high = middle
-    if high > 0:
-        share = min(max((place - at_m[low]) / (at_m[high] - at_m[low]), 0.0), 1.0)
-        planned_m = path.profile_m[low] + share * (path.profile_m[high] - path.profile_m[low])
+    begins_m = path.begins_m[int(pilot.report[slot.LEG])] + pilot.report[slot.ALONG]
+    for place in (begins_m, begins_m + _AHEAD_M):
+        low, high = 0, at_m.shape[0] - 1
+        while high - low > 1:
+            middle = (low + high) // 2
+            if at_m[middle] <= place:
+                low = middle
+            else:
+                high = middle
+        if high > 0:
+            share = min(max((place - at_m[low]) / (at_m[high] - at_m[low]), 0.0), 1.0)
+            deepest = path.profile_m[low] + share * (path.profile_m[high] - path.profile_m[low])
+            planned_m = min(planned_m, deepest)
     if pilot.memory[slot.FLOOR_KNOWN] == 0.0:
         limits = guidance.limits
         return float(min(limits.blind_depth_m, limits.max_depth_m - _CAUTION_M, planned_m))
@@ -415,9 +420,13 @@ def _on_path(tick: Tick) -> None:
             memory[slot.RAMP] += lag_s * speed
     target = _minded_m(tick)
     sink_to(target, memory[slot.FLOOR_SLOPE], tick)
+    off, waits = abs(estimate[vector.DEPTH] - target), False
+    if path.profile_m.shape[0] > 0 and guidance.under_way.circle_m == 0.0:
+        memory[slot.PACE] *= min(max(2.0 - off / _OFF_M, 0.0), 1.0)
+        waits = off > DEPTH_KEPT_M
     if memory[slot.STANDING] == 0.0:
         follow(leg, along, tick)
-    elif stand(leg, tick):
+    elif stand(leg, tick) and not waits:
         over = leg + 1 == path.length_m.shape[0]
         if not over:
             report[slot.LEG], report[slot.ALONG] = leg + 1, 0.0

@@ -126,6 +126,35 @@ def test_altitude_errs_as_the_beams_say(floor: FloorGrid, low: float, high: floa
     assert low < np.sqrt(np.mean((error[known] / sigma[known]) ** 2)) < high
 
 
+def wall(height_m: float) -> FloorGrid:
+    """A level floor that a wall, oblique to the track, ends at."""
+    north, east = np.meshgrid(*2 * [np.arange(400) * SPACING_M - 10.0], indexing="ij")
+    return FloorGrid(-10.0, -10.0, SPACING_M, 15.0 + height_m * (0.8 * north + 0.6 * east > 5.0))
+
+
+@pytest.mark.parametrize(
+    ("floor", "most_optimistic", "least_m"),
+    [
+        (slope(0.0), 0.05, -0.1), (relief(0.1, 0.3), 0.15, -0.6), (relief(0.3, 0.5), 0.1, -1.5),
+        (wall(6.0), 0.05, -1.2),
+    ],
+)  # fmt: skip
+def test_clearance_is_rarely_less_than_heard_also_above_the_edge_of_a_wall(
+    floor: FloorGrid, most_optimistic: float, least_m: float
+) -> None:
+    """With the hull wholly over what is high, as the plan has it, a wall costs a margin alone."""
+    run = fly(SensorSuite().pack(), track(300.0), floor, 3)
+    places = floor.north_m + floor.spacing_m * np.arange(len(floor.depth_m))
+    depth_at = RegularGridInterpolator((places, places), floor.depth_m, method="nearest")
+    turns = Rotation.from_quat(run.truth[:, 3:7])
+    low = [run.truth[:, :3] + turns.apply(point) for point in run.sensors.low]
+    true = np.min([depth_at(point[:, :2]) - point[:, 2] for point in low], axis=0)
+    error = run.log[:, LOG_COLUMNS.index("clearance_m")] - true
+    error = error[np.isfinite(error) & (true < 3.0)]
+    assert len(error) > 1000 and np.mean(error > 0.0) < most_optimistic
+    assert np.quantile(error, 0.01) > least_m
+
+
 def test_altitude_is_carried_by_depth_and_given_up_in_time() -> None:
     dvl = DvlSpec(outlier_probability=0.0)
     suite = SensorSuite(dvl=dvl, dvl_dropouts_s=((30.0, 40.0),), altitude_age_s=3.0)
