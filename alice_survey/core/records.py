@@ -587,6 +587,7 @@ class ErrorOverSigma(JsonRecord):
     """Errors of heights over their stated sigmas."""
 
     rms: float | None
+    median: float | None = None
 
 
 class SurfaceErrors(JsonRecord):

@@ -88,6 +88,7 @@ class SurfaceScore:
             ),
             "error_over_sigma": {
                 "rms": json_number(rms(ratio), 3),
+                "median": json_number(median(ratio), 3),
                 "robust": json_number(MAD_TO_SIGMA * median(np.abs(ratio)), 3),
                 "within_1_sigma": json_number(float(np.mean(np.abs(ratio) < 1)), 4),
                 "within_2_sigma": json_number(float(np.mean(np.abs(ratio) < 2)), 4),

@@ -159,8 +159,8 @@ class Surface:
     sigma_median: float
     """Sigma of the heights; NaN where none is stated."""
     sigma_95: float
-    stations_median: float
-    """Stations that see a cell."""
+    unchecked: float
+    """Share of the cells that fewer than three stations see."""
     covered: float
     """Share of the planned area with a height; NaN without a plan."""
 
@@ -200,11 +200,13 @@ def _surface(held: Held) -> Surface:
     return Surface(
         area=known * cell**2, cell=cell, low=float(low), high=float(high),
         sigma_median=float(middle), sigma_95=float(most),
-        stations_median=float(np.median(stations)) if known else math.nan,
+        unchecked=float(np.mean(stations < _MIN_STATIONS)) if known else math.nan,
         covered=reached / requested if requested else math.nan,
     )  # fmt: skip
 
 
+_MIN_STATIONS = 3
+"""Stations that must see a point, so that more than one pair checks its height."""
 _KEPT = 16
 """Step between the cells that enter medians: half a million of a DEM of 3,000 by 3,000."""
 

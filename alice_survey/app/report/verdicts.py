@@ -36,8 +36,9 @@ _HONEST = (0.7, 1.4)
 """Errors over stated sigmas, root mean square, that are neither too large nor too small."""
 _MIN_COVERED, _WELL_COVERED = 0.9, 0.99
 _MIN_REGISTERED = 0.9
-_MIN_STATIONS = 3.0
-"""Stations that must see a point, so that more than one pair checks its height."""
+_MAX_LEAN = 0.5
+"""Median error over sigma that the sigmas, which count errors that cells share, still cover."""
+_MAX_UNCHECKED = 0.25
 _MAX_MISFIT_SIGMAS = 5.0
 _NAMED = 4
 _MAX_ACTIONS = 2
@@ -175,11 +176,11 @@ def _surface(held: Held) -> Iterator[Verdict]:
             "the sigma of heights is above the mosaic's pixel",
             "Fly lower or with more overlap for better heights.",
         )
-    if surface.stations_median < _MIN_STATIONS:
+    if surface.unchecked > _MAX_UNCHECKED:
         yield _verdict(
-            f"most points are seen from {surface.stations_median:.0f} stations only, so that "
-            "nothing checks their heights",
-            "Plan more forward overlap.",
+            f"{share(surface.unchecked)} of the surface are seen from fewer than three stations, so "
+            "that nothing checks their heights",
+            "Plan more forward overlap, or a margin beyond the area.",
         )
 
 
@@ -196,12 +197,15 @@ def _truth(held: Held) -> Iterator[Verdict]:
         good=surface.distance_rms_mm <= surface.ground_pixel_mm,
         bad=True,
     )
-    ratio = None if surface.error_over_sigma is None else surface.error_over_sigma.rms
-    if ratio is not None:
+    over = surface.error_over_sigma
+    if over is not None and over.rms is not None:
+        lean = over.median or 0.0
         yield _verdict(
-            f"errors of heights over their stated sigmas: {ratio:.2f} rms (1 is expected)",
-            "Multiply the stated sigmas by this factor where it matters.",
-            good=_HONEST[0] <= ratio <= _HONEST[1],
+            f"errors of heights over their stated sigmas: {over.rms:.2f} rms (1 is expected), "
+            f"{lean:+.2f} in the median",
+            "Multiply the stated sigmas by this factor where it matters, and take control points for "
+            "a median off zero: heights share an error.",
+            good=_HONEST[0] <= over.rms <= _HONEST[1] and abs(lean) <= _MAX_LEAN,
         )
 
 

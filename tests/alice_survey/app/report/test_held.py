@@ -20,7 +20,7 @@ def test_area_relief_and_cover_are_those_of_the_plane(held: Held) -> None:
     assert surface.covered == pytest.approx(1.0 - 400 / cells)
     assert surface.high - surface.low == pytest.approx(SLOPE * COLUMNS * CELL_M, rel=0.06)
     assert surface.sigma_median == pytest.approx(SIGMA_M, rel=1e-6)
-    assert surface.stations_median == 4
+    assert surface.unchecked == 0.0
 
 
 def test_place_on_earth_is_the_rms_of_the_cameras_level_sigmas(held: Held) -> None:

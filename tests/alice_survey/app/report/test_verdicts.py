@@ -65,12 +65,13 @@ def test_a_model_without_scale_is_bad_and_says_what_to_do(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    ("miss_mm", "ratio", "levels"),
-    [(0.5, 1.1, ("good", "good")), (5.0, 1.1, ("bad", "good")), (0.5, 3.4, ("good", "look")),
-     (0.5, 0.3, ("good", "look"))],
+    ("miss_mm", "ratio", "lean", "levels"),
+    [(0.5, 1.1, 0.3, ("good", "good")), (5.0, 1.1, -0.3, ("bad", "good")),
+     (0.5, 3.4, 0.0, ("good", "look")), (0.5, 0.3, 0.0, ("good", "look")),
+     (0.5, 1.0, -0.77, ("good", "look"))],
 )  # fmt: skip
 def test_errors_are_judged_by_the_pixel_and_by_their_sigmas(
-    tmp_path: Path, miss_mm: float, ratio: float, levels: tuple[str, str]
+    tmp_path: Path, miss_mm: float, ratio: float, lean: float, levels: tuple[str, str]
 ) -> None:
     workspace = tiny_workspace(tmp_path)
     write_json(workspace / "evaluation" / "stage.json", {"took_s": 1.0})
@@ -81,7 +82,8 @@ def test_errors_are_judged_by_the_pixel_and_by_their_sigmas(
         "mosaic": {}, "lengths": {},
         "surface": {
             "distance_rms_mm": miss_mm, "ground_pixel_mm": 1.8, "doming": {"dome_mm": 0.1},
-            "error_over_sigma": {"rms": ratio}, "completeness_within_px": {"3": 0.99},
+            "error_over_sigma": {"rms": ratio, "median": lean},
+            "completeness_within_px": {"3": 0.99},
         },
     })  # fmt: skip
     _, found = judged(workspace)
