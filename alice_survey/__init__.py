@@ -23,7 +23,7 @@ if TYPE_CHECKING:
         read_track,
     )
     from alice_survey.app.api.figures import plot_dem, plot_mosaic, plot_plan, plot_track
-    from alice_survey.app.api.survey import Survey
+    from alice_survey.app.api.survey import Survey, call
     from alice_survey.core.config import SurveyConfig, load_config
     from alice_survey.core.errors import AliceError
     from alice_survey.core.frames import Datum
@@ -43,7 +43,7 @@ _HOMES = {
     "alice_survey.app.api.arrays": (
         "Dem", "Mosaic", "Track", "read_dem", "read_mosaic", "read_track",
     ),
-    "alice_survey.app.api.survey": ("Survey",),
+    "alice_survey.app.api.survey": ("Survey", "call"),
     "alice_survey.core.config": ("SurveyConfig", "load_config"),
     "alice_survey.core.errors": ("AliceError",),
     "alice_survey.core.frames": ("Datum",),
@@ -60,39 +60,11 @@ _HOMES = {
 }  # fmt: skip
 
 __all__ = [
-    "AliceError",
-    "Camera",
-    "Covariance",
-    "Datum",
-    "Dem",
-    "DomePort",
-    "FisheyeLens",
-    "FlatPort",
-    "Mosaic",
-    "OpenCVLens",
-    "Plan",
-    "Rig",
-    "SparseModel",
-    "Survey",
-    "SurveyConfig",
-    "Track",
-    "Triangulation",
-    "View",
-    "design_rig",
-    "load_config",
-    "n_water",
-    "plot_dem",
-    "plot_mosaic",
-    "plot_plan",
-    "plot_track",
-    "read_dem",
-    "read_model",
-    "read_mosaic",
-    "read_plan",
-    "read_rig",
-    "read_track",
-    "triangulate",
-    "write_rig",
+    "AliceError", "Camera", "Covariance", "Datum", "Dem", "DomePort", "FisheyeLens", "FlatPort",
+    "Mosaic", "OpenCVLens", "Plan", "Rig", "SparseModel", "Survey", "SurveyConfig", "Track",
+    "Triangulation", "View", "call", "design_rig", "load_config", "n_water", "plot_dem",
+    "plot_mosaic", "plot_plan", "plot_track", "read_dem", "read_model", "read_mosaic",
+    "read_plan", "read_rig", "read_track", "triangulate", "write_rig",
 ]  # fmt: skip
 
 

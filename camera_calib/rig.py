@@ -11,7 +11,7 @@ from scipy.spatial.transform import RigidTransform
 
 from alice_survey.core.artefacts import check_type, read_json, write_json
 from alice_survey.core.config import CameraConfig, WaterConfig
-from alice_survey.core.contents import as_line, one_line
+from alice_survey.core.contents import as_line, in_workspace, one_line
 from alice_survey.core.errors import CalibrationError, warn
 from alice_survey.core.frames import BODY_FROM_NADIR_CAM, Array, pose_from_json, pose_to_json
 from camera_calib.camera import Camera, camera_from_json
@@ -249,7 +249,7 @@ class _RigFile(_FilePart):
 
 
 def read_rig(path: str | Path) -> Rig:
-    """Read `rig.json`.
+    """Read `rig.json`, or the calibrated one of a workspace.
 
     Raises:
         CalibrationError: a key is missing or a value is wrong; the message names the file.
@@ -261,7 +261,7 @@ def read_rig(path: str | Path) -> Rig:
         >>> alice.read_rig("drawn.json").reference
         'left'
     """
-    path = Path(path)
+    path = in_workspace(path, "calibration/rig.json")
     data = read_json(path)
     try:
         if not isinstance(data, dict) or data.get("format") != _FORMAT["format"]:

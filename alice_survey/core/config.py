@@ -53,6 +53,10 @@ class Config(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
+    def __repr__(self) -> str:
+        """What differs from the defaults."""
+        return f"{type(self).__name__}({self.model_dump(exclude_defaults=True)})"
+
     @field_validator("*", mode="before")
     @classmethod
     def _refuse_booleans_as_numbers(cls, value: object, info: ValidationInfo) -> object:

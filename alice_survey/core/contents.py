@@ -145,6 +145,12 @@ def one_line(error: BaseException) -> str:
     return as_line(str(error)) or type(error).__name__
 
 
+def in_workspace(path: str | Path, within: str) -> Path:
+    """A file or folder itself, or of a workspace what lies in this place."""
+    path, inner = Path(path), Path(path) / within
+    return inner if path.is_dir() and (inner.suffix or inner.exists()) else path
+
+
 def first_fault(error: "ValidationError", whole: str = "") -> str:
     """The first value that a model refuses, and why, on one line.
 

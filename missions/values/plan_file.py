@@ -12,9 +12,10 @@ from pydantic import TypeAdapter
 from shapely.errors import ShapelyError
 
 from alice_survey.core.artefacts import read_json
-from alice_survey.core.contents import as_line, one_line
+from alice_survey.core.contents import as_line, in_workspace, one_line
 from alice_survey.core.errors import PlanError
 from alice_survey.core.frames import Datum
+from alice_survey.kit.words import count, duration, share
 from missions.values.area import Area
 from missions.values.legs import Leg, Route
 from missions.values.line import Line
@@ -75,7 +76,7 @@ class Dive:
         )
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Plan:
     """What to fly and how to take pictures; `plan.json`.
 
@@ -126,6 +127,12 @@ class Plan:
     """Deepest depth of the glass on each leg of each dive, over a bathymetry; NaN: not known."""
     details: dict[str, Any]
     """Further facts for a reader; nothing is computed from it."""
+
+    def __repr__(self) -> str:
+        return (
+            f"plan: {count(len(self.lines), 'line')}, {count(self.stations, 'station')}, "
+            f"{duration(self.duration_s)}, {share(self.coverage)} at the requested overlap"
+        )
 
     @property
     def allowed_offset_m(self) -> float:
@@ -214,7 +221,7 @@ class Plan:
 
 
 def read_plan(path: str | Path) -> Plan:
-    """Read `plan.json`.
+    """Read `plan.json`, or that of a workspace.
 
     Raises:
         PlanError: it is not a plan, or lacks something.
@@ -226,7 +233,7 @@ def read_plan(path: str | Path) -> Plan:
         >>> len(plan.dives)
         1
     """
-    path = Path(path)
+    path = in_workspace(path, "plan/plan.json")
     data = read_json(path)
     try:
         if {key: data[key] for key in _FORMAT} != _FORMAT:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.core.contents import taken_from
+from alice_survey.core.contents import in_workspace, taken_from
 from alice_survey.core.frames import Array, Datum
 from alice_survey.core.records import CamerasRecord, FrameRecord, PlaceRecord
 from camera_calib.approximation.pinhole_warp import Pinhole, PinholeWarp, warp_from_json
@@ -161,7 +161,7 @@ def read_warps(path: Path) -> dict[str, PinholeWarp]:
 
 
 def read_model(sparse: str | Path) -> SparseModel:
-    """Read the model of a finished `sparse/` stage.
+    """Read the model of a finished `sparse/` stage, or of a workspace.
 
     Raises:
         WorkspaceError: a file is missing, or not as it was written.
@@ -172,7 +172,7 @@ def read_model(sparse: str | Path) -> SparseModel:
         >>> alice.read_model("small/sparse").frame.name
         'ned'
     """
-    sparse = Path(sparse)
+    sparse = in_workspace(sparse, "sparse")
     from reconstruct.views.model_files import read_reconstruction
 
     stored = CamerasRecord.read(sparse / "cameras.json")

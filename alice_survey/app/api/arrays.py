@@ -11,7 +11,7 @@ from rasterio.enums import Resampling
 from rasterio.windows import Window
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.core.contents import taken_from
+from alice_survey.core.contents import in_workspace, taken_from
 from alice_survey.core.frames import Array
 from alice_survey.kit.words import count
 from reconstruct.placing.track import read_track_poses
@@ -123,7 +123,7 @@ def read_dem(workspace: str | Path, max_cells: int = 4000) -> Dem:
     """Read the surface of a reconstructed workspace.
 
     Args:
-        workspace: its folder.
+        workspace: its folder, or a `dem.tif` with `sigma.tif` beside it.
         max_cells: rows and columns at most; a larger raster is averaged by blocks.
 
     Raises:
@@ -134,9 +134,9 @@ def read_dem(workspace: str | Path, max_cells: int = 4000) -> Dem:
         >>> alice.read_dem("small", max_cells=50).height.shape[0] <= 50
         True
     """
-    folder = Path(workspace) / "dense"
-    height, place = _read(folder / "dem.tif", [1], max_cells)
-    sigma, _ = _read(folder / "sigma.tif", [1], max_cells)
+    path = in_workspace(workspace, "dense/dem.tif")
+    height, place = _read(path, [1], max_cells)
+    sigma, _ = _read(path.with_name("sigma.tif"), [1], max_cells)
     return Dem(height=height[0].astype(float), sigma=sigma[0].astype(float), **place)
 
 
@@ -144,7 +144,7 @@ def read_mosaic(workspace: str | Path, max_pixels: int = 4000) -> Mosaic:
     """Read the mosaic of a reconstructed workspace.
 
     Args:
-        workspace: its folder.
+        workspace: its folder, or a `mosaic.tif`.
         max_pixels: rows and columns at most; a larger raster is averaged by blocks.
 
     Raises:
@@ -155,7 +155,8 @@ def read_mosaic(workspace: str | Path, max_pixels: int = 4000) -> Mosaic:
         >>> alice.read_mosaic("small", max_pixels=100).rgba.dtype
         dtype('uint8')
     """
-    bands, place = _read(Path(workspace) / "mosaic" / "mosaic.tif", [1, 2, 3, 4], max_pixels)
+    path = in_workspace(workspace, "mosaic/mosaic.tif")
+    bands, place = _read(path, [1, 2, 3, 4], max_pixels)
     return Mosaic(rgba=np.ascontiguousarray(bands.transpose(1, 2, 0)), **place)
 
 
@@ -210,6 +211,14 @@ class Track(_Shown):
             return None
         return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2)[:, :3])
 
+    @property
+    def table(self) -> dict[str, Any]:
+        """Columns of positions and their sigmas, as `pandas.DataFrame` and its like take them."""
+        columns = {"image": np.array(self.images)}
+        columns |= dict(zip("xyz", self.world_from_cam.translation.T, strict=True))
+        sigma = () if self.sigma is None else self.sigma.T
+        return columns | dict(zip(("sigma_x", "sigma_y", "sigma_z"), sigma, strict=False))
+
     def __repr__(self) -> str:
         text = f"track: {count(len(self.images), 'picture')} in the frame '{self.frame.name}'"
         if self.sigma is not None:
@@ -221,7 +230,7 @@ def read_track(workspace: str | Path) -> Track:
     """Read the camera track of a reconstructed workspace.
 
     Args:
-        workspace: its folder.
+        workspace: its folder, or its `sparse/`.
 
     Raises:
         WorkspaceError: there is no track, or a file is damaged.
@@ -231,7 +240,7 @@ def read_track(workspace: str | Path) -> Track:
         >>> alice.read_track("small").covariance.shape[1:]
         (6, 6)
     """
-    folder = Path(workspace) / "sparse"
+    folder = in_workspace(workspace, "sparse")
     poses = read_track_poses(folder / "track.csv")
     images = tuple(sorted(poses))
     return Track(

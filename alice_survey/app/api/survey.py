@@ -1,15 +1,56 @@
 """A survey's workspace as one object."""
 
 import html
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from alice_survey.app.api.arrays import Dem, Mosaic, Track, read_dem, read_mosaic, read_track
 from alice_survey.core.config import SurveyConfig
+from alice_survey.core.contents import first_fault
+from alice_survey.core.errors import ConfigError, file_faults
 from camera_calib.rig import Rig, design_rig, read_rig
 from missions.values.plan_file import Plan, read_plan
 from reconstruct.views.model import SparseModel, read_model
+
+
+def call(command: str, **options: Any) -> Any:
+    """Do what a command of the command line does.
+
+    Args:
+        command: its words after `alice-survey`, such as `measure` or `plan check`.
+        options: as its help names them, with `_` for `-`, and its arguments.
+
+    Returns:
+        What it prints with `--json`; None of a command that has no such option.
+
+    Raises:
+        ConfigError: there is no such command or option, or a value is none that it takes.
+        AliceError: it cannot be done; the message states what to change.
+
+    Example:
+        >>> import alice_survey as alice
+        >>> alice.call("fov", validate=True)["passed"]
+        True
+    """
+    import typer
+    from pydantic import ValidationError
+
+    from alice_survey.app.commands import COMMANDS
+
+    kinds = {kind.name: kind for kind in COMMANDS}
+    if command not in kinds:
+        raise ConfigError(f"there is no command {command!r}: one of {', '.join(sorted(kinds))}")
+    kind = kinds[command]
+    fields = {kind.option_name(one)[2:].replace("-", "_"): one for one in kind.model_fields}
+    try:
+        result = kind(**{fields.get(name, name): value for name, value in options.items()}).run()
+    except ValidationError as error:
+        raise ConfigError(f"{command}: {first_fault(error)}") from None
+    except typer.BadParameter as error:
+        raise ConfigError(f"{command}: {error.message}") from None
+    return None if result is None else result[1]
 
 
 @dataclass(frozen=True)
@@ -64,6 +105,29 @@ class Survey:
         from alice_survey.core.stages import is_imported
 
         return settings(self.folder, None, needed=not is_imported(self.folder))
+
+    def with_settings(self, **sections: Mapping[str, Any]) -> "Survey":
+        """This survey after a change of settings in `survey.toml`, whose comments stay.
+
+        Args:
+            sections: settings and their values, by section; None takes a setting out.
+
+        Raises:
+            ConfigError: a value is not one that a survey may have; the file is as it was.
+
+        Example:
+            >>> import alice_survey as alice
+            >>> wreck = alice.Survey.new("wreck").with_settings(plan={"altitude_m": 1.5})
+            >>> wreck.config.plan.altitude_m
+            1.5
+        """
+        from missions.plan.preview import draft_settings
+
+        path = self.folder / "survey.toml"
+        with file_faults(path, ConfigError):
+            text = path.read_bytes().decode()
+        draft_settings(text, path, sections).write()
+        return self
 
     def run(self, *stages: str, threads: int | None = None) -> dict[str, Any]:
         """Run stages in the order given; those that are up to date are skipped.

@@ -178,8 +178,8 @@ def _surface(held: Held) -> Iterator[Verdict]:
         )
     if surface.unchecked > _MAX_UNCHECKED:
         yield _verdict(
-            f"{share(surface.unchecked)} of the surface are seen from fewer than three stations, so "
-            "that nothing checks their heights",
+            f"{share(surface.unchecked)} of the surface are seen from fewer than three stations: "
+            "nothing checks their heights",
             "Plan more forward overlap, or a margin beyond the area.",
         )
 
@@ -203,8 +203,8 @@ def _truth(held: Held) -> Iterator[Verdict]:
         yield _verdict(
             f"errors of heights over their stated sigmas: {over.rms:.2f} rms (1 is expected), "
             f"{lean:+.2f} in the median",
-            "Multiply the stated sigmas by this factor where it matters, and take control points for "
-            "a median off zero: heights share an error.",
+            "Multiply the stated sigmas by this factor where it matters; a median off zero is an "
+            "error that heights share, which control points find.",
             good=_HONEST[0] <= over.rms <= _HONEST[1] and abs(lean) <= _MAX_LEAN,
         )
 

@@ -8,8 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import RigidTransform
 
 import alice_survey as alice
+from reconstruct.views.model import WorldFrame
 from tests.alice_survey.app.report.tiny import write_raster
 
 NEEDS_A_MODEL = '"small'
@@ -71,7 +73,7 @@ def test_names_for_readers_and_for_type_checkers_are_the_same() -> None:
     lazy = {name: home for home, names in alice._HOMES.items() for name in names}
     assert seen == lazy
     assert sorted(seen) == sorted(alice.__all__)
-    assert len(seen) <= 33
+    assert len(seen) <= 34
 
 
 def test_an_unknown_name_is_an_attribute_error() -> None:
@@ -103,3 +105,37 @@ def test_an_averaged_surface_stays_in_its_place(tmp_path: Path) -> None:
     east, north = dem.west + (column + 0.5) * dem.cell, dem.north - (row + 0.5) * dem.cell
     expected = 0.5 * ((40.0 - north) / 0.1 - 0.5) - 0.25 * ((east - 7.0) / 0.1 - 0.5)
     np.testing.assert_allclose(dem.height, expected, atol=1e-4)
+
+
+def test_commands_take_the_names_of_their_help_and_readers_a_workspace(tmp_path: Path) -> None:
+    reef = alice.Survey.new(tmp_path, example="demo").with_settings(plan={"altitude_m": 1.5})
+    assert reef.config.plan.altitude_m == 1.5 and len(repr(reef.config)) < 800
+    with pytest.raises(alice.AliceError, match="altitude_m"):
+        reef.with_settings(plan={"altitude_m": -1})
+    assert "altitude_m = 1.5" in (tmp_path / "survey.toml").read_text(encoding="utf-8")
+    shown = alice.call(
+        "fov", survey=tmp_path / "survey.toml", altitude=[1.5], csv=tmp_path / "a.csv"
+    )
+    assert shown == alice.call("fov", altitude=[1.5], survey=tmp_path / "survey.toml")
+    for name, options in {
+        "none": {},
+        "fov": {"lenz": 3},
+        "report": {"workspace": __file__},
+    }.items():
+        with pytest.raises(alice.AliceError):
+            alice.call(name, **options)
+    plan = reef.plan()
+    assert alice.read_plan(tmp_path) == alice.read_plan(tmp_path / "plan" / "plan.json") == plan
+    assert len(repr(plan)) < 100
+
+
+def test_a_track_is_a_table() -> None:
+    track = alice.Track(
+        images=("a.png", "b.png"), covariance=np.array([np.eye(6), 4 * np.eye(6)]),
+        world_from_cam=RigidTransform.from_translation([[1, 2, 3], [4, 5, 6]]),
+        frame=WorldFrame(name="ned", datum=None, scaled=True, vertical_datum="none"),
+    )  # fmt: skip
+    assert {name: list(column) for name, column in track.table.items()} == {
+        "image": ["a.png", "b.png"], "x": [1, 4], "y": [2, 5], "z": [3, 6],
+        "sigma_x": [1, 2], "sigma_y": [1, 2], "sigma_z": [1, 2],
+    }  # fmt: skip
