@@ -40,6 +40,8 @@ Three ways to begin:
   alice-survey demo                        # a small survey, from plan to report
   alice-survey reconstruct PHOTOS -o dive  # a folder of pictures, to the report
   alice-survey init reef --area reef.kml   # a survey to plan and fly"""
+_METAVARS = {"Literal": None, "Path": "PATH", "str": "TEXT", "int": "N", "float": "NUMBER"}
+"""What a value is called in the help, by its type; of a choice, its choices."""
 RENAMED = {
     "simulate": "pilot --simulated",
     "scale": "control",
@@ -186,7 +188,9 @@ def _parameter(name: str, kind: Any, default: Any = inspect.Parameter.empty) -> 
 def _of_field(kind: type[CommandModel], name: str) -> inspect.Parameter:
     """The parameter of a field: its help, metavar and bounds."""
     field, extra = kind.model_fields[name], kind.declaration(name)
-    about: dict[str, Any] = {"help": field.description, "metavar": extra["metavar"]}
+    kind_of = str(field.annotation)
+    metavar = next((m for known, m in _METAVARS.items() if known in kind_of), None)
+    about: dict[str, Any] = {"help": field.description, "metavar": extra["metavar"] or metavar}
     names = extra["names"]
     if field.annotation is bool and not names:
         names = (kind.option_name(name),)  # else there was also one to say no

@@ -8,7 +8,7 @@ export function keyFigures(t) {
   return [
     ["Time", duration(t.duration_s)], ["Dives", String(t.dives)],
     ["Energy", Math.round(t.energy_wh) + " Wh"], ["Pictures", t.pictures.toLocaleString("en")],
-    ["Data", number(t.data_gb, "GB")], ["Covered", share(t.covered)],
+    ["Data", number(t.data_gb, "GB")], ["At the overlap", share(t.at_overlap)],
   ];
 }
 
@@ -18,7 +18,7 @@ export function summaryOf(preview) {
   const {totals: t, warnings, holes} = preview;
   return [
     counted(t.lines, "line") + ", " + duration(t.duration_s) + ", " + counted(t.dives, "dive"),
-    counted(t.pictures, "picture"), share(t.covered) + " covered",
+    counted(t.pictures, "picture"), share(t.at_overlap) + " of the area at the requested overlap",
     ...(holes.length ? [counted(holes.length, "hole")] : []),
     ...(warnings.length ? [counted(warnings.length, "warning")] : []),
   ].join(", ");
