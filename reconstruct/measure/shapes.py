@@ -512,7 +512,8 @@ def _layers(
             raise WorkspaceError(f"{shown}: no attribute {label!r}; there are {known}")
         names = _LABELS if label is None else (label.lower(),)
         column = next((columns[fields[name]] for name in names if name in fields), None)
-        read = shapely.make_valid(shapely.from_wkb(shapes, on_invalid="fix"))
+        fixed = shapely.from_wkb(shapes, on_invalid="fix")
+        read = shapely.make_valid(fixed, method="structure", keep_collapsed=False)
         for number, geometry in enumerate(read):
             parts = shapely.get_parts(shapely.get_parts(geometry))
             areal = [one for one in parts if one.geom_type == "Polygon" and one.area > 0]

@@ -152,8 +152,8 @@ class WorkspaceCommand(CommandModel):
 
     def show_next(self, found: object, folder: Path) -> None:
         """Show what was brought into a folder, and the command that goes on."""
-        after = offer("reconstruct", "-w", self.workspace)
-        typer.echo(f"{found}\nin {folder}; next: {after}")
+        after = "" if self.quiet else f"; next: {offer('reconstruct', '-w', self.workspace)}"
+        typer.echo(f"{found}\nin {folder}{after}")
 
 
 class SurveyCommand(WorkspaceCommand, ReportCommand):

@@ -265,7 +265,7 @@ class ReconstructCommand(DeviceCommand):
 
         if self.output is not None:
             shared = {"workspace": self.output, "threads": self.threads}
-            ImportImagesCommand(folders=[self.workspace], **shared).run()
+            ImportImagesCommand(folders=[self.workspace], quiet=True, **shared).run()
             rest = self.model_copy(update={"workspace": self.output, "output": None})
             text, values = rest.run()
             self.say(text)
