@@ -97,6 +97,16 @@ class _Grouped(TyperGroup):
                 formatter.write_dl([(n, one.get_short_help_str(width)) for n, one in rows])
 
 
+class _WithFolder(TyperGroup):
+    """A command that has others below it, and takes a folder as they do."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse the arguments."""
+        first = args[0] if args else "-"
+        is_folder = first not in self.commands and first[0] != "-" and Path(first).is_dir()
+        return super().parse_args(ctx, ["-w", *args] if is_folder else args)
+
+
 def make_app(commands: Sequence[type[CommandModel]] = (*COMMANDS, StudioCommand)) -> typer.Typer:
     """The program of some commands; those of two words are below the group of the first."""
     app = typer.Typer(
@@ -111,12 +121,13 @@ def make_app(commands: Sequence[type[CommandModel]] = (*COMMANDS, StudioCommand)
         rich_markup_mode=None,
     )
     parents = {"": app}
-    names = {command.name for command in commands}
+    names = {command.name: command for command in commands}
     for name in dict.fromkeys(one.name.split()[0] for one in commands if " " in one.name):
-        alone = name in names
+        alone, in_folder = name in names, issubclass(names.get(name, object), WorkspaceCommand)
         parents[name] = typer.Typer(
             help=None if alone else _VEHICLE, invoke_without_command=alone,
             no_args_is_help=not alone, context_settings=CONTEXT, rich_markup_mode=None,
+            cls=_WithFolder if in_folder else None,
         )  # fmt: skip
     for command in commands:
         group, _, name = command.name.rpartition(" ")
