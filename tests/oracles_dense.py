@@ -99,7 +99,7 @@ def projected(grid: DemGrid, points: np.ndarray, row: int, column: int) -> dict[
     share = np.maximum(1 - np.abs(away), 0.0).prod(axis=1)
     wall = (np.abs(normal[:, 2]) < edge_on) & (np.abs(away).max(axis=1) <= 0.75)
     near = (normal[:, 2] >= edge_on) & (share > 1e-3)
-    if wall.any() or not near.any():
+    if not near.any():
         return nothing
     p, share, rise = points[near], share[near], normal[near, :2] / normal[near, 2:]
     height = p["enu"][:, 2] + grid.cell * (away[near] * rise).sum(axis=1)
@@ -123,12 +123,15 @@ def projected(grid: DemGrid, points: np.ndarray, row: int, column: int) -> dict[
     highest = mean(top, height)
     scatter = mean(top, (height - highest) ** 2)
     nearest = p[top[np.argmax(share[top])]]
+    variance = mean(top, sigma) ** 2 + scatter + mean(top, shared) ** 2
+    ends = points["enu"][wall, 2] if wall.any() else np.array([highest])
+    reach = max(ends.max() - highest, highest - ends.min())
     return {
         "height": highest,
-        "sigma": math.sqrt(mean(top, sigma) ** 2 + scatter + mean(top, shared) ** 2),
+        "sigma": math.sqrt(variance + reach**2 / math.sqrt(24.0 * math.pi)),
         "count": int(nearest["views"]),
         "stations": int(nearest["stations"]),
-        "surfaces": len(layers),
+        "surfaces": max(len(layers), 2 if reach > 0 else 1),
         "lower": mean(layers[-1], height) if len(layers) > 1 else math.nan,
     }
 

@@ -65,7 +65,7 @@ class Raster:
 
 DEM = Raster(
     file="dense/dem.tif", title="Height", unit=LENGTH, band="height {over}",
-    about="Height of the sea floor, shaded from the north-west.", palette="viridis", shaded=True,
+    about="Height of the surface, shaded from the upper left.", palette="viridis", shaded=True,
     listed="elevation model (GeoTIFF)",
 )  # fmt: skip
 SIGMA = Raster(
@@ -95,7 +95,7 @@ RASTERS = (
     ERROR,
     Raster(
         file="dense/slope.tif", title="Slope", unit="degrees", band="steepest slope (degrees)",
-        about="Steepness of the sea floor.", palette="magma", limits="from zero",
+        about="Steepness of the surface.", palette="magma", limits="from zero",
     ),
     STATIONS,
     Raster(

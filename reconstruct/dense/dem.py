@@ -1,7 +1,8 @@
 """The digital elevation model: a surface projected on a grid, heights up, with their sigmas."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -26,7 +27,10 @@ _MIN_COMPANY = 0.22
 """Share of that square that must be known: what is more isolated is a rim of a wall, mostly."""
 _MIN_WEIGHT = 1e-3
 _WALL_CELLS = 0.25
-"""A wall empties cells that it is nearer to than this, along both axes."""
+"""A wall is within cells that it is nearer to than this, along both axes."""
+_BEYOND_RIM = 1.0 / math.sqrt(24.0 * math.pi)
+"""Chance that the middle of a cell at a rim is beyond it: a rim that is anywhere between two
+middles is known to a cell, that is with a sigma of 1 / sqrt(12) of one."""
 _MIN_SHARE = 0.25
 """Sum of the shares of points from which a cell's height is more than a guess at its rim."""
 _APART_SIGMAS = 5.0
@@ -63,8 +67,7 @@ def cells_over(grid: DemGrid, surface: NDArray[Any]) -> FusedCells:
 
     A point's tangent plane gives the height in the middle of a cell; of points around it each
     counts with the share of a bilinear interpolation. Surfaces that the grid's viewer sees from
-    behind do not count. A cell in which one stands that is seen edge-on has no one height and is
-    left empty.
+    behind do not count. Where one stands that is seen edge-on, heights are as unsure as at a rim.
 
     Args:
         grid: cells, in the coordinates of the points.
@@ -74,12 +77,14 @@ def cells_over(grid: DemGrid, surface: NDArray[Any]) -> FusedCells:
     row = (grid.north - surface["enu"][:, 1].astype(np.float64)) / grid.cell - 0.5
     facing = surface["normal"][:, 2] >= EDGE_ON
     upright = np.abs(surface["normal"][:, 2]) < EDGE_ON
-    walls = np.zeros((grid.rows, grid.columns), np.bool_)
+    foot, top = np.full((2, grid.rows, grid.columns), np.nan, np.float32)
     for down in (-_WALL_CELLS, _WALL_CELLS):
         for right in (-_WALL_CELLS, _WALL_CELLS):
             r, c = np.rint(row[upright] + down), np.rint(column[upright] + right)
             inside = (r >= 0) & (r < grid.rows) & (c >= 0) & (c < grid.columns)
-            walls[r[inside].astype(np.int64), c[inside].astype(np.int64)] = True
+            at = r[inside].astype(np.int64), c[inside].astype(np.int64)
+            for extreme, ends in ((np.fmin, foot), (np.fmax, top)):
+                extreme.at(ends, at, surface["enu"][upright, 2][inside])
     surface, row, column = surface[facing], row[facing], column[facing]
     owner, point, weight = [], [], []
     for down in (0, 1):
@@ -92,14 +97,14 @@ def cells_over(grid: DemGrid, surface: NDArray[Any]) -> FusedCells:
             weight.append(w[taken])
     cells, points, weights = (np.concatenate(parts) for parts in (owner, point, weight))
     order = np.argsort(cells, kind="stable")
-    order = order[~walls.reshape(-1)[cells[order]]]
     starts = np.searchsorted(cells[order], np.arange(grid.rows * grid.columns + 1))
     found: tuple[Any, ...] = project_cells(
         starts, points[order], weights[order], surface["enu"], surface["normal"],
         surface["sigma"], surface["shared"], surface["views"], surface["stations"],
         grid.west, grid.north, grid.cell, grid.columns,
     )  # fmt: skip
-    return FusedCells(*(band.reshape(grid.rows, grid.columns) for band in found))
+    cells_found = FusedCells(*(band.reshape(grid.rows, grid.columns) for band in found))
+    return _widen(cells_found, np.fmax(top - cells_found.height, cells_found.height - foot))
 
 
 @compiled
@@ -213,13 +218,44 @@ def project_cells(
     return height, sigma, count, met, surfaces, lowest
 
 
+def widen_at_rims(cells: FusedCells, cell: float) -> FusedCells:
+    """Add to sigmas at rims what the other surface would do to heights.
+
+    Between a cell and the next one known in any direction is a rim where heights differ by more
+    than noise and a continuous surface explain: a slope of 45 degrees, and what the surfaces on
+    both sides gain. The rim itself is known to a cell, so that the middles of cells next to it lie
+    on its other side with a known probability: two surfaces may be within the cell.
+    """
+    bands, reach = (cells.height, cells.sigma), np.zeros(cells.height.shape)
+    for way in _WAYS:
+        gains = [np.abs(cells.height - _next_known((cells.height,), w, 1)[0]) for w in (way, -way)]
+        there, spread, gain, steps = _next_known((*bands, gains[0]), way, FILL_CELLS + 1)
+        apart = np.abs(cells.height - there)
+        explained = steps * (cell + np.nan_to_num(np.fmax(gain, gains[1])))
+        explained += _APART_SIGMAS * np.hypot(cells.sigma, spread)
+        reach = np.fmax(reach, np.where(apart > explained, apart, 0.0))
+    return _widen(cells, reach)
+
+
+def _widen(cells: FusedCells, reach: Array | Float32) -> FusedCells:
+    """Cells with another surface so far above or below; none where `reach` is NaN or 0."""
+    rim = np.isfinite(cells.height) & (reach > 0)
+    wide = np.sqrt(np.square(cells.sigma) + _BEYOND_RIM * np.square(reach))
+    return replace(
+        cells,
+        sigma=np.where(rim, wide, cells.sigma).astype(np.float32),
+        surfaces=np.where(rim, np.maximum(cells.surfaces, 2), cells.surfaces),
+    )
+
+
 def fill_gaps(height: Float32, sigma: Float32, reach: int, cell: float) -> tuple[Float32, Float32]:
-    """Bridge small gaps in straight lines between what lies on either side.
+    """Bridge small gaps between what lies on either side.
 
     A gap's cell is filled where, along at least two of the four lines through it (rows, columns
-    and both diagonals), known cells lie within `reach` on both sides, unless the line between them
-    is so steep that it is a step. Its standard deviation is the larger of the ends' plus half their
-    difference.
+    and both diagonals), known cells lie within `reach` on both sides: in straight lines, unless one
+    of these is so steep that it is a step. Then the nearest of the known cells' heights holds, of
+    several the highest. The standard deviation is the largest of the ends' plus twice the scatter
+    of the lines, or half the range of heights at a step.
 
     Args:
         height: (H, W), NaN where unknown.
@@ -230,31 +266,65 @@ def fill_gaps(height: Float32, sigma: Float32, reach: int, cell: float) -> tuple
     Returns:
         Copies of both with small gaps filled.
     """
-    padded = [np.pad(band.astype(float), reach, constant_values=np.nan) for band in (height, sigma)]
-    lines, total, weights, widest = np.zeros((4, *height.shape))
-    for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
-        ends = np.full((2, 3, *height.shape), np.nan)
-        for end, way in zip(ends, (1, -1), strict=True):
-            for n in range(reach, 0, -1):  # the nearest last
-                top, left = reach + way * n * down, reach + way * n * right
-                part = np.s_[top : top + height.shape[0], left : left + height.shape[1]]
-                known = np.isfinite(padded[0][part])
-                sources: tuple[Any, ...] = padded[0][part], padded[1][part], n
-                for values, found in zip(end, sources, strict=True):
-                    np.copyto(values, found, where=known)
+    lines, total, squares, weights, widest = np.zeros((5, *height.shape))
+    step = np.zeros(height.shape, np.bool_)
+    nearest, low, high, closest = np.full((4, *height.shape), np.inf)
+    high, nearest = -high, -nearest
+    for way in _WAYS[:4]:
+        ends = [_next_known((height, sigma), one, reach) for one in (way, -way)]
         (first, spread, a), (second, other_spread, b) = ends
-        with np.errstate(invalid="ignore"):
-            fine = np.abs(first - second) <= _STEP * (a + b) * cell
-        w = np.where(fine, 1.0 / (a + b), 0.0)
-        lines += fine
-        total += np.where(fine, w * (first * b + second * a) / (a + b), 0.0)
-        weights += w
-        wide = np.maximum(spread, other_spread) + 0.5 * np.abs(first - second)
-        widest = np.where(fine, np.maximum(widest, wide), widest)
+        both = np.isfinite(first + second)
+        step |= both & (np.abs(first - second) > _STEP * (a + b) * cell)
+        lines += both
+        between, weight = (first * b + second * a) / (a + b), np.where(both, 1.0 / (a + b), 0.0)
+        total += np.where(both, weight * between, 0.0)
+        squares += np.where(both, weight * between**2, 0.0)
+        weights += weight
+        widest = np.where(both, np.fmax(widest, np.fmax(spread, other_spread)), widest)
+        for found, _, steps in ends:
+            off = steps * float(np.hypot(*way))
+            better = both & ((off < closest) | ((off == closest) & (found > nearest)))
+            nearest, closest = np.where(better, found, nearest), np.where(better, off, closest)
+            low, high = (
+                np.where(both, f(x, found), x) for f, x in ((np.fmin, low), (np.fmax, high))
+            )
     gap = np.isnan(height) & (lines >= 2)
     with np.errstate(invalid="ignore"):
-        filled = np.where(gap, total / weights, height).astype(np.float32)
-    return filled, np.where(gap, widest, sigma).astype(np.float32)
+        filled, square = total / weights, squares / weights
+        scatter = np.sqrt(np.maximum(square - filled**2, 0.0))
+        wide = widest + np.where(step, 0.5 * (high - low), 2.0 * scatter)
+        filled = np.where(step, nearest, filled)
+    return (
+        np.where(gap, filled, height).astype(np.float32),
+        np.where(gap, wide, sigma).astype(np.float32),
+    )
+
+
+_WAYS = np.array([(0, 1), (1, 0), (1, 1), (1, -1), (0, -1), (-1, 0), (-1, -1), (-1, 1)])
+"""To the eight neighbours of a cell, down and right; the last four are against the first."""
+
+
+def _next_known(bands: Sequence[Float32 | Array], way: NDArray[Any], reach: int) -> Array:
+    """Values at the next cell one way in which the first band is known, and steps to it.
+
+    Args:
+        bands: (H, W) each.
+        way: (2,) one step down and right.
+        reach: in steps.
+
+    Returns:
+        (bands + 1, H, W); NaN where there is none within reach.
+    """
+    padded = np.pad(bands, ((0, 0), (reach, reach), (reach, reach)), constant_values=np.nan)
+    rows, columns = bands[0].shape
+    found = np.full((len(bands) + 1, rows, columns), np.nan)
+    for steps in range(reach, 0, -1):  # the nearest last
+        top, left = reach + steps * way
+        there = padded[:, top : top + rows, left : left + columns]
+        known = np.isfinite(there[0])
+        for values, source in zip(found, (*there, steps), strict=True):
+            np.copyto(values, source, where=known)
+    return found
 
 
 def slope_deg(height: Float32, cell: float) -> Float32:

@@ -29,6 +29,7 @@ from reconstruct.dense.dem import (
     cells_over,
     fill_gaps,
     slope_deg,
+    widen_at_rims,
     without_strays,
 )
 from reconstruct.dense.matching_trial import (
@@ -225,7 +226,9 @@ def project_tile(
     surface = on_plane(setup, tiles, plane, np.array([grid.west, grid.north, up]))
     cells = cells_over(grid.translate(-grid.west, -grid.north), surface)
     cells = cells.without(~without_strays(cells.height))
-    height, sigma = fill_gaps(cells.height, cells.sigma, FILL_CELLS, grid.cell)
+    height, bridged = fill_gaps(cells.height, cells.sigma, FILL_CELLS, grid.cell)
+    cells = widen_at_rims(cells, grid.cell)
+    sigma = np.where(np.isfinite(cells.height), cells.sigma, bridged)
     bands: dict[str, NDArray[Any]] = {
         "dem": (height + up).astype(np.float32),
         "sigma": sigma,

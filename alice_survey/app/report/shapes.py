@@ -46,7 +46,7 @@ def shape_layers(held: Held) -> Iterator[ShapeLayer]:
     made = (
         _layer("area", "Area to survey", "As given in the plan.", "polygon",
                [(_pairs(ring), "") for ring in rings], colour=_BLACK, dashed=True),
-        _layer("footprints", "Footprints", "Sea floor that each picture shows.", "polygon",
+        _layer("footprints", "Footprints", "Surface that each picture shows.", "polygon",
                list(_footprints(held)), colour=_GREEN, shown=False),
         _layer("plan", "Plan", "Survey lines as planned.", "line", planned, colour=_BLUE,
                dashed=True),
