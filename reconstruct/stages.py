@@ -118,7 +118,12 @@ def _mosaic_inputs(workspace: Path) -> list[Path]:
     about = _existing(*(path.with_name("plane.json") for path in (dense / "dem.tif", *planes)))
     about += _existing(dense / "moving.csv", workspace / COLOUR_FILE)
     cloud = [dense / name for name in ("cloud.ply", "cloud.json")]
-    return [dense / "dem.tif", *planes, *cloud, *about, *_model_inputs(workspace)]
+    surfaces = [
+        path.with_name(name)
+        for path in (dense / "dem.tif", *planes)
+        for name in ("dem.tif", "sigma.tif", "count.tif")
+    ]
+    return [*surfaces, *cloud, *about, *_model_inputs(workspace)]
 
 
 def _mosaic_summary(folder: Path) -> Summary:
@@ -252,7 +257,7 @@ MOSAIC = StageSpec(
     folder="mosaic",
     command="reconstruct",
     about="the orthomosaic, painted on the surface",
-    version=13,
+    version=14,
     work="reconstruct.mosaic.run:run_mosaic",
     takes=("reconstruct", "water", "area.seafloor_depth_m"),
     needs=("image", "placing", "dense"),

@@ -157,6 +157,9 @@ class Scene:
     """Depth from north and east, metres."""
     paint: Callable[[Array, Array], Array]
     """BGR levels (..., 3) from north and east."""
+    cast: Callable[[Array, Array], Array] | None = None
+    """How far rays (..., 3) from places (..., 3) go, in their lengths, where that is not known by
+    depths: paint is then drawn through such a scene along one slant, so that sides have some."""
 
 
 def flat(north: Array, east: Array) -> Array:
@@ -203,6 +206,49 @@ def block_scene() -> Scene:
     return Scene(depth_of=sloped_with_step, paint=speckle())
 
 
+def boulder_scene(seed: int) -> Scene:
+    """Three boulders and a thin ledge that leans over the floor, as triangles traced by open3d."""
+    import open3d as o3d
+
+    rng, line = np.random.default_rng(seed), np.linspace(-1.5, 2.5, 161)
+    north, east = np.meshgrid(line, line, indexing="ij")
+    floor = 0.05 * north - 0.03 * east + 0.02 * np.sin(5 * north + seed) * np.sin(4 * east)
+    mesh = o3d.geometry.TriangleMesh
+    corner = np.arange(161 * 160).reshape(160, 161)[:, :-1, None]
+    triangles = np.concatenate(
+        [corner + np.array(one) for one in ((0, 161, 162), (0, 162, 1))]
+    ).reshape(-1, 3)
+    parts = [(np.stack([north, east, floor], axis=-1).reshape(-1, 3), triangles)]
+    places = ((0.15, 0.2, -0.07), (0.6, 0.45, -0.06), (0.2, 0.72, -0.05))
+    for place, radius, squash in zip(places, (0.17, 0.12, 0.09), (0.7, 0.9, 0.8), strict=True):
+        ball = mesh.create_sphere(radius, 40)
+        corners = np.asarray(ball.vertices)
+        bumps = [size * np.sin(corners @ rng.normal(0, 1 / (size * 26 * radius), 3) * 9)
+                 for size in (0.12, 0.06)]  # fmt: skip
+        corners = corners * (1 + np.sum(bumps, axis=0))[:, None] * [1, 1, squash]
+        parts.append((corners + place, np.asarray(ball.triangles)))
+    ledge = mesh.create_box(0.3, 0.3, 0.03)
+    turn = Rotation.from_euler("ZYX", [15 + 20 * seed, 4, 3], degrees=True)
+    ledge.rotate(turn.as_matrix(), center=(0.15, 0.15, 0))
+    parts.append(
+        (np.asarray(ledge.vertices) + np.array([0.45, -0.15, -0.2]), np.asarray(ledge.triangles))
+    )
+    solid = o3d.t.geometry.RaycastingScene()
+    for corners, faces in parts:
+        solid.add_triangles((corners + DEPTH_M * _DOWN).astype(np.float32), faces.astype(np.uint32))
+
+    def cast(starts: Array, rays: Array) -> Array:
+        found = solid.cast_rays(np.concatenate([starts, rays], axis=-1).astype(np.float32))
+        return np.asarray(found["t_hit"].numpy(), np.float64)
+
+    def depth_of(north: Array, east: Array) -> Array:
+        top = np.stack([north, east, np.full(np.shape(north), DEPTH_M - 1.0)], axis=-1)
+        return DEPTH_M - 1.0 + cast(top, np.broadcast_to(_DOWN, top.shape))
+
+    return Scene(depth_of=depth_of, paint=speckle(), cast=cast)
+
+
+_DOWN = np.array([0.0, 0.0, 1.0])
 PERIOD_M = 0.3
 
 
@@ -290,6 +336,8 @@ def hits(view: View, scene: Scene, oversample: int = 1) -> Array:
     rays = np.stack([grid_x, grid_y, np.ones_like(grid_x)], axis=-1)
     world = view.world_from_cam.rotation.apply(rays.reshape(-1, 3)).reshape(rays.shape)
     centre = view.world_from_cam.translation
+    if scene.cast is not None:
+        return centre + scene.cast(np.broadcast_to(centre, world.shape), world)[..., None] * world
     reach = np.full(grid_x.shape, 0.9 * ALTITUDE_M)
     for _ in range(45):  # down in small steps while above the surface, so that edges hide
         points = centre + reach[..., None] * world
@@ -301,7 +349,8 @@ def hits(view: View, scene: Scene, oversample: int = 1) -> Array:
 def render(view: View, scene: Scene) -> np.ndarray:
     """A picture (H, W, 3), each pixel the mean of 2 x 2 samples, without noise."""
     points = hits(view, scene, oversample=2)
-    fine = scene.paint(points[..., 0], points[..., 1])
+    slant = (points[..., 2] - DEPTH_M) * (scene.cast is not None)
+    fine = scene.paint(points[..., 0] + 0.45 * slant, points[..., 1] + 0.7 * slant)
     mean = fine.reshape(view.pinhole.height_px, 2, view.pinhole.width_px, 2, 3).mean(axis=(1, 3))
     return np.rint(np.clip(mean, 0, 255)).astype(np.uint8)
 

@@ -21,7 +21,14 @@ from alice_survey.core.artefacts import atomic_path
 from alice_survey.core.run.resources import release_memory
 from reconstruct.light.solve import LightSamples, at_places, joined_samples
 from reconstruct.mosaic.colour import ColourModel
-from reconstruct.mosaic.grid import ALIGNED_PX, CELL_PX, Block, coarse, dem_around
+from reconstruct.mosaic.grid import (
+    ALIGNED_PX,
+    CELL_PX,
+    Block,
+    coarse,
+    dem_around,
+    height_at_pixels,
+)
 from reconstruct.mosaic.picture_measures import DARKEST, linear_table, read_small, well_exposed
 from reconstruct.mosaic.seams import Blend, candidates, choose_views
 from reconstruct.mosaic.visibility import (
@@ -38,7 +45,7 @@ from reconstruct.mosaic.visibility import (
 )
 from reconstruct.pictures.undistorted import Pictures
 from reconstruct.raster import small_cache
-from reconstruct.views.model import View
+from reconstruct.views.model import View, enu_from_cam
 
 _CACHED_BYTES = 100_000_000
 """Pictures as taken that each process keeps."""
@@ -176,6 +183,8 @@ class Labels:
     """(rows, columns) how many pictures see the cell."""
     stations: NDArray[np.uint16]
     """(rows, columns) how many stations do."""
+    places: NDArray[np.uint16]
+    """(rows, columns) sigma of places, thousandths, on interpolated surface; 0 elsewhere."""
     tones: Float32
     """(3, rows, columns) logarithm of the broad light that all views agree on, BGR."""
 
@@ -300,8 +309,25 @@ def label_block(task: PaintTask) -> Labels:
         label=label[inner],
         pictures=pictures[inner],
         stations=stations[inner],
+        places=_sigma_of_places(task, surface, label)[inner],
         tones=tones[inner].transpose(2, 0, 1),
     )
+
+
+def _sigma_of_places(
+    task: PaintTask, surface: GridHeights, label: NDArray[np.int32]
+) -> NDArray[np.uint16]:
+    """Sigmas of places by that of interpolated heights along the rays of the cells' views."""
+    grid, found = surface.grid, np.zeros(label.shape, np.uint16)
+    bridged, around = dem_around(task.survey.sights / BRIDGED, grid, 0.0)
+    spread = height_at_pixels(np.nan_to_num(bridged), around, grid)
+    for entry in task.views if (spread > 0).any() else ():
+        rows, columns = np.nonzero((label == entry.number + 1) & (spread > 0))
+        east, north, up = enu_from_cam(entry.view, np.zeros(3))[:, 3]
+        aside = np.hypot(grid.east_of(columns + 0.5) - east, grid.north_of(rows + 0.5) - north)
+        shifts = spread[rows, columns] * aside / (up - surface.height[rows, columns])
+        found[rows, columns] = np.clip(np.ceil(1e3 * shifts), 1, np.iinfo(np.uint16).max)
+    return found
 
 
 def settled_around(task: PaintTask) -> NDArray[np.int32]:
@@ -555,8 +581,9 @@ def _inner(block: Block, side_px: int = CELL_PX) -> tuple[slice, slice]:
     return slice(margin, margin + rows), slice(margin, margin + columns)
 
 
-LABELS, TONES = "labels.tif", "tones.tif"
-"""Files of the survey's labels, and of its broad tones, by cell."""
+LABELS, TONES, BRIDGED = "labels.tif", "tones.tif", "bridged.tif"
+"""Files of the survey's labels, and of its broad tones, by cell; of sigmas where the surface is
+interpolated, 0 where it is measured."""
 
 
 def _read_cells(survey: MosaicSetup, block: Block) -> tuple[NDArray[np.int32], Float32]:

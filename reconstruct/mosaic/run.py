@@ -10,7 +10,7 @@ the room of the strip.
 
 import json
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -25,8 +25,10 @@ from rasterio.windows import Window
 from alice_survey.core.config import ReconstructConfig, WaterConfig
 from alice_survey.core.errors import ReconstructionError, warn
 from alice_survey.core.executor import Executor
+from alice_survey.core.frames import Array
 from alice_survey.core.records import MosaicRecord, PicturesRecord
 from alice_survey.core.run import progress
+from reconstruct.dense.dem import fill_gaps
 from reconstruct.light.solve import joined_samples
 from reconstruct.mosaic.colour import ColourModel, solve_colour
 from reconstruct.mosaic.exports import write_footprints
@@ -44,6 +46,7 @@ from reconstruct.mosaic.grid import (
     neighbours,
 )
 from reconstruct.mosaic.paint import (
+    BRIDGED,
     LABELS,
     TONES,
     BlockTask,
@@ -72,8 +75,11 @@ from reconstruct.raster import (
     geotiff_profile,
     grid_of,
     opened_raster,
+    read_cells,
     round_cell,
     small_cache,
+    tiled_raster,
+    tiles_of,
     write_png,
 )
 from reconstruct.views.model import SparseModel, WorldFrame, read_model, read_warps
@@ -121,26 +127,36 @@ def write_labels(
     frame: WorldFrame,
     blocks: Iterator[Labels],
     threads: int,
-) -> None:
-    """Write view and tones of each cell, and a raster of how many pictures and stations see it."""
+) -> float:
+    """Write view and tones of each cell, and a raster of how many pictures and stations see it.
+
+    Returns:
+        Share of the cells with a view whose surface is interpolated.
+    """
+    seen, between = 0, 0
     shared = geotiff_profile(coarse(grid), frame, threads) | {"zlevel": 1}
     with (
         rasterio.open(cells_of[0], "w", count=1, dtype="int32", **shared) as labels,
         rasterio.open(
             cells_of[1], "w", count=3, dtype="float32", **shared | {"compress": None}
         ) as tones,
-        rasterio.open(coverage, "w", count=2, dtype="uint16", predictor=2, **shared) as raster,
+        rasterio.open(coverage, "w", count=3, dtype="uint16", predictor=2, **shared) as raster,
     ):
         raster.update_tags(**frame_tags(frame))
         raster.set_band_description(1, "pictures that see the cell")
         raster.set_band_description(2, "stations that see the cell")
+        about = "sigma of a place, where the surface is interpolated, in thousandths of a "
+        raster.set_band_description(3, about + frame.unit + "; 0 where it was measured")
         for block in blocks:
             top, left = block.block.core.row_off // CELL_PX, block.block.core.col_off // CELL_PX
             high, wide = block.label.shape
             window = Window(left, top, wide, high)
             labels.write(block.label, 1, window=window)
             tones.write(block.tones, window=window)
-            raster.write(np.stack([block.pictures, block.stations]), window=window)
+            raster.write(np.stack([block.pictures, block.stations, block.places]), window=window)
+            seen += np.count_nonzero(block.label)
+            between += np.count_nonzero(block.places)
+    return between / max(seen, 1)
 
 
 @progress.step("write the mosaic with overviews")
@@ -282,6 +298,7 @@ def paint_plane(painting: Painting, plane: Plane, dem: Path, folder: Path) -> bo
         heights = height_range(raster)
         pixel = reconstruct.mosaic_pixel_m or round_cell(mean_pixel(model))
     grid = mosaic_grid(grid_of(dem), pixel)
+    dem = _bridge(dem, sights, model.frame, executor, partial(_label, plane))
     names = [view.image for view in model.views]
     outline = partial(outline_view, dem, sights, heights)
     label = partial(_label, plane)
@@ -326,7 +343,7 @@ def paint_plane(painting: Painting, plane: Plane, dem: Path, folder: Path) -> bo
             yield from executor.map(label_block, tasks, label=label(name), task_mib=_TASK_MIB)
 
     files, threads = (sights / LABELS, sights / TONES), executor.local_cores
-    write_labels(files, folder / "coverage.tif", grid, model.frame, labels(), threads)
+    between = write_labels(files, folder / "coverage.tif", grid, model.frame, labels(), threads)
     tiles = blocks_of(grid, ground, _TILE_PX, SUPPORT_PX)
     rough = sights / "rough.tif"
     groups = [[task(tile) for tile in group] for group in neighbours(tiles, _GROUP * _TILE_PX)]
@@ -358,11 +375,55 @@ def paint_plane(painting: Painting, plane: Plane, dem: Path, folder: Path) -> bo
             "colour": reconstruct.colour,
             **colour.to_json(),
             "dispersion": painting.dispersion,
-            "notes": [*model.frame.notes, *colour.notes],
+            "notes": [
+                *model.frame.notes,
+                *colour.notes,
+                f"{between:.1%} of the mosaic lies on a surface that is interpolated between its "
+                "rims: band 3 of coverage.tif",
+            ],
             "pictures": names,
         },
     )
     return True
+
+
+_BRIDGED_CELLS = 32
+"""Gaps of the surface that are painted over: cells to what is known, at most, on either side."""
+_TILE_CELLS = 256
+
+
+def _bridge(
+    dem: Path, sights: Path, frame: WorldFrame, executor: Executor, label: Callable[[str], str]
+) -> Path:
+    """Write a DEM without its gaps, and sigmas where it is interpolated."""
+    grid, threads = grid_of(dem), executor.local_cores
+    files = sights / "ground.tif", sights / BRIDGED
+    tiles = executor.map(
+        partial(_bridge_tile, dem), tiles_of(grid, _TILE_CELLS), label=label("bridge gaps")
+    )
+    with (
+        tiled_raster(files[0], grid, frame, "float32", np.nan, "height", threads=threads) as ground,
+        tiled_raster(files[1], grid, frame, "float32", np.nan, "sigma", threads=threads) as sigma,
+    ):
+        for window, bands in tiles:
+            for raster, band in zip((ground, sigma), bands, strict=True):
+                raster.write(band, 1, window=window)
+    return files[0]
+
+
+def _bridge_tile(dem: Path, window: Window) -> tuple[Window, Array]:
+    """Heights of a tile, and sigmas of those that are interpolated, 0 of others, (2, H, W)."""
+    rim = _BRIDGED_CELLS
+    place = int(window.row_off) - rim, int(window.col_off) - rim
+    size = int(window.height) + 2 * rim, int(window.width) + 2 * rim
+    height, sigma, count = (
+        read_cells(dem.with_name(f"{name}.tif"), *place, *size)
+        for name in ("dem", "sigma", "count")
+    )
+    if np.isnan(height).any():
+        height, sigma = fill_gaps(height, sigma, rim, grid_of(dem).cell)
+    bands = np.stack([height, np.where(count > 0, 0.0, sigma)]).astype(np.float32)
+    return window, bands[:, rim:-rim, rim:-rim]
 
 
 def _label(plane: Plane, what: str) -> str:

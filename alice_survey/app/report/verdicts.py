@@ -272,8 +272,8 @@ def facts(held: Held) -> list[tuple[str, str]]:
 def _result(held: Held) -> str:
     surface, plan, pixel = held.surface, held.plan, held.pixel_m
     if surface is not None:
-        kind = "a simulated sea floor" if held.simulated else "sea floor"
-        kind = kind if held.plane is None else "surface"
+        known = held.plane is None and held.frame.datum is not None
+        kind = ("a simulated sea floor" if held.simulated else "sea floor") if known else "surface"
         painted = f", painted at {length(pixel, held.unit)} a pixel" if pixel == pixel else ""
         return (
             f"{digits(surface.area)} {held.unit}² of {kind} with "

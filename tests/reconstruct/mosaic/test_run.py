@@ -36,6 +36,10 @@ CONFIG = SurveyConfig(reconstruct=ReconstructConfig(mosaic_pixel_m=PIXEL_M, colo
 EVEN = SurveyConfig(reconstruct=ReconstructConfig(mosaic_pixel_m=PIXEL_M, colour="even"))
 
 
+GAP = np.s_[60:80, 40:60]
+"""Cells within the survey of which no depth is known."""
+
+
 def terraced(north: np.ndarray, east: np.ndarray) -> np.ndarray:
     """A slope: warps that forget the height are off by up to 60 mm."""
     return DEPTH_M + 0.15 * north - 0.1 * east
@@ -52,8 +56,12 @@ def write_surface(folder: Path) -> None:
     columns, rows = np.meshgrid(np.arange(grid.columns) + 0.5, np.arange(grid.rows) + 0.5)
     height = -terraced(grid.north_of(rows), grid.east_of(columns))
     height[100:, 90:] = np.nan
-    with tiled_raster(dense / "dem.tif", grid, FRAME, "float32", np.nan, "height") as raster:
-        raster.write(height.astype(np.float32), 1)
+    height[GAP] = np.nan
+    known = np.where(np.isfinite(height), 1.0, np.nan)
+    for name, band in (("dem", height), ("sigma", 1e-3 * known), ("count", known)):
+        path = dense / f"{name}.tif"
+        with tiled_raster(path, grid, FRAME, "float32", np.nan, name) as raster:
+            raster.write(band.astype(np.float32), 1)
     write_surface_cloud(dense, grid, height)
     write_json(dense / "stage.json", {})
 
@@ -115,6 +123,19 @@ def test_nothing_is_painted_where_the_surface_is_unknown(workspace: Path):
     assert hole.sum() > 100
     assert (rgba[3][hole] == 0).all()
     assert (rgba[:3][:, rgba[3] == 0] == 0).all()
+
+
+def test_a_gap_is_painted_and_marked_with_the_sigma_of_its_places(workspace: Path):
+    rgba, north, east = read(workspace)
+    rows, columns = (np.array([part.start, part.stop]) for part in GAP)
+    (high, low), (left, right) = 0.9 - rows * CELL_M, columns * CELL_M - 0.6
+    assert (rgba[3][(north < high) & (north > low) & (east > left) & (east < right)] > 0).all()
+    (_, _, places), north, east = read_raster(workspace / "mosaic" / "coverage.tif", None)
+    far = 0.05
+    inside = (north < high) & (north > low) & (east > left) & (east < right)
+    near = (north < high + far) & (north > low - far) & (east > left - far) & (east < right + far)
+    assert (places[inside] == 1).all()  # 1 mm of height, looked at from 2 m above: less, rounded up
+    assert (places[~near] == 0).all()
 
 
 def test_source_names_the_picture_nearest_to_straight_above(workspace: Path):

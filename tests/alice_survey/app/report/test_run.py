@@ -73,7 +73,7 @@ def test_a_model_without_a_place_is_reported(tmp_path: Path, scaled: bool, unit:
     data = json.loads((workspace / "report" / "report.json").read_text())
     assert data["unit"] == unit
     page = (workspace / "report" / "report.html").read_text(encoding="utf-8")
-    assert f"{unit}² of sea floor" in page
+    assert f"{unit}² of surface" in page
     shown = json.loads(re.findall(r'id="map-data">(.*?)</script>', page)[0])
     cameras = next(layer for layer in shown["layers"] if layer["name"] == "cameras")
     # As in its rasters, a model's own y goes to the right and its x up.
@@ -90,6 +90,7 @@ def test_a_survey_of_a_wall_alone_is_reported_on_its_own_axes(tmp_path: Path) ->
     names = {layer["name"] for layer in shown["layers"]}
     assert names.isdisjoint({"cameras", "footprints", "plan"})
     assert shown["axes"] == ["right", "up"]
+    assert "sea floor" not in page.lower()
     data = json.loads((workspace / "report" / "report.json").read_text())
     assert data["surface"]["covered"] is None
 
