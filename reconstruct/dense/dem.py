@@ -19,8 +19,10 @@ Float32 = NDArray[np.float32]
 
 FILL_CELLS = 3
 """Cells that lie no farther than this from known ones on opposite sides are filled."""
-_STEP = 2.0
-"""Slope from which two cells have a step between them."""
+_STEP = 1.0
+"""Slope from which two cells have a step between them, unless the surface is as steep around."""
+_MAX_GAIN = math.tan(math.acos(EDGE_ON))
+"""Slope of the steepest surface that counts."""
 STRAY_CELLS = 8
 """Reach of the square around a cell in which others must be known."""
 _MIN_COMPANY = 0.22
@@ -67,7 +69,8 @@ def cells_over(grid: DemGrid, surface: NDArray[Any]) -> FusedCells:
 
     A point's tangent plane gives the height in the middle of a cell; of points around it each
     counts with the share of a bilinear interpolation. Surfaces that the grid's viewer sees from
-    behind do not count. Where one stands that is seen edge-on, heights are as unsure as at a rim.
+    behind do not count. Where one stands that is seen edge-on, heights are as unsure as at a rim;
+    where it rises above all that is known around, what is seen from above is not known.
 
     Args:
         grid: cells, in the coordinates of the points.
@@ -104,7 +107,9 @@ def cells_over(grid: DemGrid, surface: NDArray[Any]) -> FusedCells:
         grid.west, grid.north, grid.cell, grid.columns,
     )  # fmt: skip
     cells_found = FusedCells(*(band.reshape(grid.rows, grid.columns) for band in found))
-    return _widen(cells_found, np.fmax(top - cells_found.height, cells_found.height - foot))
+    around = cv2.dilate(np.nan_to_num(cells_found.height, nan=-np.inf), np.ones((3, 3), np.uint8))
+    hidden = top - around > grid.cell  # by what the wall ends in, which is not known
+    return _widen(cells_found, cells_found.height - foot).without(hidden)
 
 
 @compiled
@@ -223,15 +228,19 @@ def widen_at_rims(cells: FusedCells, cell: float) -> FusedCells:
 
     Between a cell and the next one known in any direction is a rim where heights differ by more
     than noise and a continuous surface explain: a slope of 45 degrees, and what the surfaces on
-    both sides gain. The rim itself is known to a cell, so that the middles of cells next to it lie
+    both sides gain, or where of several surfaces in a cell the next cells know none. The rim itself is known to a cell, so that the middles of cells next to it lie
     on its other side with a known probability: two surfaces may be within the cell.
     """
-    bands, reach = (cells.height, cells.sigma), np.zeros(cells.height.shape)
+    bands, known = (cells.height, cells.sigma), np.isfinite(cells.height).astype(np.uint8)
+    ends = cv2.erode(known, np.ones((3, 3), np.uint8)) < known
+    reach = np.where(ends, np.nan_to_num(cells.height - cells.lower), 0.0)
     for way in _WAYS:
         gains = [np.abs(cells.height - _next_known((cells.height,), w, 1)[0]) for w in (way, -way)]
         there, spread, gain, steps = _next_known((*bands, gains[0]), way, FILL_CELLS + 1)
         apart = np.abs(cells.height - there)
-        explained = steps * (cell + np.nan_to_num(np.fmax(gain, gains[1])))
+        length = cell * float(np.hypot(*way))
+        gain = np.fmin(np.nan_to_num(np.fmax(gain, gains[1])), _MAX_GAIN * length)
+        explained = steps * (length + gain)
         explained += _APART_SIGMAS * np.hypot(cells.sigma, spread)
         reach = np.fmax(reach, np.where(apart > explained, apart, 0.0))
     return _widen(cells, reach)
@@ -248,7 +257,9 @@ def _widen(cells: FusedCells, reach: Array | Float32) -> FusedCells:
     )
 
 
-def fill_gaps(height: Float32, sigma: Float32, reach: int, cell: float) -> tuple[Float32, Float32]:
+def fill_gaps(
+    height: Float32, sigma: Float32, reach: int, cell: float, *, over_steps: bool
+) -> tuple[Float32, Float32]:
     """Bridge small gaps between what lies on either side.
 
     A gap's cell is filled where, along at least two of the four lines through it (rows, columns
@@ -262,6 +273,7 @@ def fill_gaps(height: Float32, sigma: Float32, reach: int, cell: float) -> tuple
         sigma: (H, W) of the heights.
         reach: in cells.
         cell: side of a cell.
+        over_steps: whether cells with a step over them are filled too.
 
     Returns:
         Copies of both with small gaps filled.
@@ -288,7 +300,7 @@ def fill_gaps(height: Float32, sigma: Float32, reach: int, cell: float) -> tuple
             low, high = (
                 np.where(both, f(x, found), x) for f, x in ((np.fmin, low), (np.fmax, high))
             )
-    gap = np.isnan(height) & (lines >= 2)
+    gap = np.isnan(height) & (lines >= 2) & (over_steps | ~step)
     with np.errstate(invalid="ignore"):
         filled, square = total / weights, squares / weights
         scatter = np.sqrt(np.maximum(square - filled**2, 0.0))

@@ -226,7 +226,7 @@ def project_tile(
     surface = on_plane(setup, tiles, plane, np.array([grid.west, grid.north, up]))
     cells = cells_over(grid.translate(-grid.west, -grid.north), surface)
     cells = cells.without(~without_strays(cells.height))
-    height, bridged = fill_gaps(cells.height, cells.sigma, FILL_CELLS, grid.cell)
+    height, bridged = fill_gaps(cells.height, cells.sigma, FILL_CELLS, grid.cell, over_steps=False)
     cells = widen_at_rims(cells, grid.cell)
     sigma = np.where(np.isfinite(cells.height), cells.sigma, bridged)
     bands: dict[str, NDArray[Any]] = {

@@ -421,7 +421,7 @@ def _bridge_tile(dem: Path, window: Window) -> tuple[Window, Array]:
         for name in ("dem", "sigma", "count")
     )
     if np.isnan(height).any():
-        height, sigma = fill_gaps(height, sigma, rim, grid_of(dem).cell)
+        height, sigma = fill_gaps(height, sigma, rim, grid_of(dem).cell, over_steps=True)
     bands = np.stack([height, np.where(count > 0, 0.0, sigma)]).astype(np.float32)
     return window, bands[:, rim:-rim, rim:-rim]
 

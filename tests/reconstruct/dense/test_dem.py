@@ -97,6 +97,10 @@ def test_where_a_wall_stands_its_ends_are_within_reach():
     assert unsure[7, 7]
     assert unsure.sum() == 1
     assert 0.3 < found.sigma[7, 7] / 2.0 < 0.4  # the wall goes down by 2 m
+    wall["enu"][:, 2] += 2.0
+    found = cells_over(GRID, np.concatenate([floor, wall]))
+    assert np.isnan(found.height[7, 7])  # what the wall carries is not known
+    assert np.isnan(found.height).sum() == 1
 
 
 def test_heights_at_rims_are_as_unsure_as_the_rim():
@@ -145,12 +149,14 @@ def test_no_step_is_averaged():
     height[:, 10:] = 1.5
     height[:, 9:12] = np.nan
     sigma = np.where(np.isnan(height), np.nan, 0.01).astype(np.float32)
-    step, spread = fill_gaps(height, sigma, 3, 0.05)  # 0.5 over 4 cells
+    step, spread = fill_gaps(height, sigma, 3, 0.05, over_steps=True)  # 0.5 over 4 cells
     assert set(np.unique(step[3:9, 9:12])) == {1.0, 1.5}
     assert (step[3:9, 9] == 1.0).all()
     assert (step[3:9, 10:12] == 1.5).all()  # in the middle what is seen from above
     assert (spread[3:9, 9:12] > 0.25).all()  # half of what lies between
-    slope, _ = fill_gaps(height, sigma, 3, 0.1)
+    left_out, _ = fill_gaps(height, sigma, 3, 0.05, over_steps=False)
+    assert np.isnan(left_out[:, 9:12]).all()
+    slope, _ = fill_gaps(height, sigma, 3, 0.2, over_steps=True)
     np.testing.assert_allclose(slope[3:9, 10], 1.25, atol=1e-6)
 
 
@@ -174,7 +180,7 @@ def test_small_gaps_are_bridged_on_the_plane_and_large_ones_stay():
     holed[12:26, 15:30] = np.nan
     sigma = np.where(np.isnan(holed), np.nan, 0.01).astype(np.float32)
 
-    height, spread = fill_gaps(holed, sigma, 3, 1.0)
+    height, spread = fill_gaps(holed, sigma, 3, 1.0, over_steps=False)
 
     np.testing.assert_allclose(height[5:8, 5:8], plane[5:8, 5:8], atol=1e-5)
     np.testing.assert_allclose(spread[5:8, 5:8], 0.01, atol=1e-5)
@@ -182,7 +188,9 @@ def test_small_gaps_are_bridged_on_the_plane_and_large_ones_stay():
     known = ~np.isnan(holed)
     np.testing.assert_array_equal(height[known], holed[known])
     edge = np.where(columns < 20, plane, np.nan).astype(np.float32)
-    assert np.isnan(fill_gaps(edge, np.full_like(edge, 0.01), 3, 1.0)[0][:, 20:]).all()
+    assert np.isnan(
+        fill_gaps(edge, np.full_like(edge, 0.01), 3, 1.0, over_steps=False)[0][:, 20:]
+    ).all()
 
 
 def test_strays_go_and_a_sheet_with_its_edge_stays():
