@@ -118,11 +118,8 @@ def _mosaic_inputs(workspace: Path) -> list[Path]:
     about = _existing(*(path.with_name("plane.json") for path in (dense / "dem.tif", *planes)))
     about += _existing(dense / "moving.csv", workspace / COLOUR_FILE)
     cloud = [dense / name for name in ("cloud.ply", "cloud.json")]
-    surfaces = [
-        path.with_name(name)
-        for path in (dense / "dem.tif", *planes)
-        for name in ("dem.tif", "sigma.tif", "count.tif")
-    ]
+    bands = ("dem.tif", "sigma.tif", "count.tif")
+    surfaces = [one.with_name(name) for one in (dense / "dem.tif", *planes) for name in bands]
     return [*surfaces, *cloud, *about, *_model_inputs(workspace)]
 
 

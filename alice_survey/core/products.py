@@ -86,7 +86,8 @@ STATIONS = Raster(
 )  # fmt: skip
 MOSAIC = Raster(
     file="mosaic/mosaic.tif", title="Mosaic", unit="red, green, blue", dtype="uint8",
-    about="What the cameras saw, each spot from the picture that sees it best.",
+    about="What the cameras saw, each spot from the picture that sees it best; where no depth is "
+    "known, on a surface that is interpolated (third band of coverage.tif).",
     listed="orthomosaic (cloud-optimised GeoTIFF)",
 )  # fmt: skip
 RASTERS = (
@@ -118,7 +119,8 @@ RASTERS = (
     ),
     Raster(
         file="mosaic/coverage.tif", title="Pictures", dtype="uint16",
-        about="Pictures that see a cell; a second band counts stations.",
+        about="Pictures that see a cell; a second band counts stations, a third has the sigma of "
+        "places where the surface is interpolated between its rims.",
     ),
     MOSAIC,
 )  # fmt: skip

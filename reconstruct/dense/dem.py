@@ -228,8 +228,8 @@ def widen_at_rims(cells: FusedCells, cell: float) -> FusedCells:
 
     Between a cell and the next one known in any direction is a rim where heights differ by more
     than noise and a continuous surface explain: a slope of 45 degrees, and what the surfaces on
-    both sides gain, or where of several surfaces in a cell the next cells know none. The rim itself is known to a cell, so that the middles of cells next to it lie
-    on its other side with a known probability: two surfaces may be within the cell.
+    both sides gain; also where a cell has several surfaces and one next to it has none. The rim is
+    known to a cell, so that the middles of cells at it lie beyond it with a known probability.
     """
     bands, known = (cells.height, cells.sigma), np.isfinite(cells.height).astype(np.uint8)
     ends = cv2.erode(known, np.ones((3, 3), np.uint8)) < known
@@ -264,9 +264,9 @@ def fill_gaps(
 
     A gap's cell is filled where, along at least two of the four lines through it (rows, columns
     and both diagonals), known cells lie within `reach` on both sides: in straight lines, unless one
-    of these is so steep that it is a step. Then the nearest of the known cells' heights holds, of
-    several the highest. The standard deviation is the largest of the ends' plus twice the scatter
-    of the lines, or half the range of heights at a step.
+    of these is so steep that it is a step: what is not seen next to one lies behind it, at the
+    lowest of the ends. The standard deviation is the largest of the ends' plus twice the scatter of
+    the lines, or half the range of heights at a step.
 
     Args:
         height: (H, W), NaN where unknown.
@@ -278,38 +278,24 @@ def fill_gaps(
     Returns:
         Copies of both with small gaps filled.
     """
-    lines, total, squares, weights, widest = np.zeros((5, *height.shape))
-    step = np.zeros(height.shape, np.bool_)
-    nearest, low, high, closest = np.full((4, *height.shape), np.inf)
-    high, nearest = -high, -nearest
-    for way in _WAYS[:4]:
-        ends = [_next_known((height, sigma), one, reach) for one in (way, -way)]
-        (first, spread, a), (second, other_spread, b) = ends
-        both = np.isfinite(first + second)
-        step |= both & (np.abs(first - second) > _STEP * (a + b) * cell)
-        lines += both
-        between, weight = (first * b + second * a) / (a + b), np.where(both, 1.0 / (a + b), 0.0)
-        total += np.where(both, weight * between, 0.0)
-        squares += np.where(both, weight * between**2, 0.0)
-        weights += weight
-        widest = np.where(both, np.fmax(widest, np.fmax(spread, other_spread)), widest)
-        for found, _, steps in ends:
-            off = steps * float(np.hypot(*way))
-            better = both & ((off < closest) | ((off == closest) & (found > nearest)))
-            nearest, closest = np.where(better, found, nearest), np.where(better, off, closest)
-            low, high = (
-                np.where(both, f(x, found), x) for f, x in ((np.fmin, low), (np.fmax, high))
-            )
-    gap = np.isnan(height) & (lines >= 2) & (over_steps | ~step)
-    with np.errstate(invalid="ignore"):
-        filled, square = total / weights, squares / weights
-        scatter = np.sqrt(np.maximum(square - filled**2, 0.0))
-        wide = widest + np.where(step, 0.5 * (high - low), 2.0 * scatter)
-        filled = np.where(step, nearest, filled)
-    return (
-        np.where(gap, filled, height).astype(np.float32),
-        np.where(gap, wide, sigma).astype(np.float32),
+    found = np.array([_next_known((height, sigma), way, reach) for way in _WAYS])
+    ends = found.reshape(2, 4, 3, *height.shape)
+    ends = np.where(np.isfinite(ends).all(axis=(0, 2), keepdims=True), ends, np.nan)
+    (first, _, a), (second, _, b) = ends.swapaxes(1, 2)
+    step = (np.abs(first - second) > _STEP * (a + b) * cell).any(axis=0)
+    gap = np.isnan(height) & (np.isfinite(first).sum(axis=0) >= 2) & (over_steps | ~step)
+    weight, between = (
+        np.nan_to_num(1.0 / (a + b)),
+        np.nan_to_num((first * b + second * a) / (a + b)),
     )
+    with np.errstate(invalid="ignore"):
+        filled = (weight * between).sum(axis=0) / weight.sum(axis=0)
+        square = (weight * np.square(between - filled)).sum(axis=0) / weight.sum(axis=0)
+    low, high = (f.reduce(ends[:, :, 0], axis=(0, 1)) for f in (np.fmin, np.fmax))
+    wide = np.fmax.reduce(ends[:, :, 1], axis=(0, 1))
+    wide += np.where(step, 0.5 * (high - low), 2.0 * np.sqrt(square))
+    filled = np.where(gap, np.where(step, low, filled), height)
+    return filled.astype(np.float32), np.where(gap, wide, sigma).astype(np.float32)
 
 
 _WAYS = np.array([(0, 1), (1, 0), (1, 1), (1, -1), (0, -1), (-1, 0), (-1, -1), (-1, 1)])

@@ -10,7 +10,8 @@ the room of the strip.
 
 import json
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -127,13 +128,8 @@ def write_labels(
     frame: WorldFrame,
     blocks: Iterator[Labels],
     threads: int,
-) -> float:
-    """Write view and tones of each cell, and a raster of how many pictures and stations see it.
-
-    Returns:
-        Share of the cells with a view whose surface is interpolated.
-    """
-    seen, between = 0, 0
+) -> None:
+    """Write view and tones of each cell, and a raster of how many pictures and stations see it."""
     shared = geotiff_profile(coarse(grid), frame, threads) | {"zlevel": 1}
     with (
         rasterio.open(cells_of[0], "w", count=1, dtype="int32", **shared) as labels,
@@ -154,9 +150,6 @@ def write_labels(
             labels.write(block.label, 1, window=window)
             tones.write(block.tones, window=window)
             raster.write(np.stack([block.pictures, block.stations, block.places]), window=window)
-            seen += np.count_nonzero(block.label)
-            between += np.count_nonzero(block.places)
-    return between / max(seen, 1)
 
 
 @progress.step("write the mosaic with overviews")
@@ -298,7 +291,7 @@ def paint_plane(painting: Painting, plane: Plane, dem: Path, folder: Path) -> bo
         heights = height_range(raster)
         pixel = reconstruct.mosaic_pixel_m or round_cell(mean_pixel(model))
     grid = mosaic_grid(grid_of(dem), pixel)
-    dem = _bridge(dem, sights, model.frame, executor, partial(_label, plane))
+    dem = _bridge(dem, sights, model.frame, executor, _label(plane, "bridge gaps"))
     names = [view.image for view in model.views]
     outline = partial(outline_view, dem, sights, heights)
     label = partial(_label, plane)
@@ -343,7 +336,7 @@ def paint_plane(painting: Painting, plane: Plane, dem: Path, folder: Path) -> bo
             yield from executor.map(label_block, tasks, label=label(name), task_mib=_TASK_MIB)
 
     files, threads = (sights / LABELS, sights / TONES), executor.local_cores
-    between = write_labels(files, folder / "coverage.tif", grid, model.frame, labels(), threads)
+    write_labels(files, folder / "coverage.tif", grid, model.frame, labels(), threads)
     tiles = blocks_of(grid, ground, _TILE_PX, SUPPORT_PX)
     rough = sights / "rough.tif"
     groups = [[task(tile) for tile in group] for group in neighbours(tiles, _GROUP * _TILE_PX)]
@@ -375,12 +368,7 @@ def paint_plane(painting: Painting, plane: Plane, dem: Path, folder: Path) -> bo
             "colour": reconstruct.colour,
             **colour.to_json(),
             "dispersion": painting.dispersion,
-            "notes": [
-                *model.frame.notes,
-                *colour.notes,
-                f"{between:.1%} of the mosaic lies on a surface that is interpolated between its "
-                "rims: band 3 of coverage.tif",
-            ],
+            "notes": [*model.frame.notes, *colour.notes],
             "pictures": names,
         },
     )
@@ -392,23 +380,19 @@ _BRIDGED_CELLS = 32
 _TILE_CELLS = 256
 
 
-def _bridge(
-    dem: Path, sights: Path, frame: WorldFrame, executor: Executor, label: Callable[[str], str]
-) -> Path:
+def _bridge(dem: Path, sights: Path, frame: WorldFrame, executor: Executor, label: str) -> Path:
     """Write a DEM without its gaps, and sigmas where it is interpolated."""
-    grid, threads = grid_of(dem), executor.local_cores
-    files = sights / "ground.tif", sights / BRIDGED
-    tiles = executor.map(
-        partial(_bridge_tile, dem), tiles_of(grid, _TILE_CELLS), label=label("bridge gaps")
-    )
-    with (
-        tiled_raster(files[0], grid, frame, "float32", np.nan, "height", threads=threads) as ground,
-        tiled_raster(files[1], grid, frame, "float32", np.nan, "sigma", threads=threads) as sigma,
-    ):
-        for window, bands in tiles:
-            for raster, band in zip((ground, sigma), bands, strict=True):
+    grid, paths = grid_of(dem), (sights / "ground.tif", sights / BRIDGED)
+    tiles = tiles_of(grid, _TILE_CELLS)
+    with ExitStack() as files:
+        rasters = [
+            files.enter_context(tiled_raster(path, grid, frame, "float32", np.nan, path.stem))
+            for path in paths
+        ]
+        for window, bands in executor.map(partial(_bridge_tile, dem), tiles, label=label):
+            for raster, band in zip(rasters, bands, strict=True):
                 raster.write(band, 1, window=window)
-    return files[0]
+    return paths[0]
 
 
 def _bridge_tile(dem: Path, window: Window) -> tuple[Window, Array]:

@@ -150,9 +150,7 @@ def test_no_step_is_averaged():
     height[:, 9:12] = np.nan
     sigma = np.where(np.isnan(height), np.nan, 0.01).astype(np.float32)
     step, spread = fill_gaps(height, sigma, 3, 0.05, over_steps=True)  # 0.5 over 4 cells
-    assert set(np.unique(step[3:9, 9:12])) == {1.0, 1.5}
-    assert (step[3:9, 9] == 1.0).all()
-    assert (step[3:9, 10:12] == 1.5).all()  # in the middle what is seen from above
+    assert (step[3:9, 9:12] == 1.0).all()  # it lies behind the rim
     assert (spread[3:9, 9:12] > 0.25).all()  # half of what lies between
     left_out, _ = fill_gaps(height, sigma, 3, 0.05, over_steps=False)
     assert np.isnan(left_out[:, 9:12]).all()
