@@ -263,17 +263,17 @@ def fill_gaps(
     """Bridge small gaps between what lies on either side.
 
     A gap's cell is filled where, along at least two of the four lines through it (rows, columns
-    and both diagonals), known cells lie within `reach` on both sides: in straight lines, unless one
-    of these is so steep that it is a step: what is not seen next to one lies behind it, at the
+    and both diagonals), known cells lie within `reach` on both sides: in straight lines along those
+    that are no steps. Where fewer than two are none, what is not seen lies behind the step, at the
     lowest of the ends. The standard deviation is the largest of the ends' plus twice the scatter of
-    the lines, or half the range of heights at a step.
+    the lines, or plus half the range of heights where one is a step.
 
     Args:
         height: (H, W), NaN where unknown.
         sigma: (H, W) of the heights.
         reach: in cells.
         cell: side of a cell.
-        over_steps: whether cells with a step over them are filled too.
+        over_steps: whether cells that have fewer than two lines without a step are filled too.
 
     Returns:
         Copies of both with small gaps filled.
@@ -282,19 +282,20 @@ def fill_gaps(
     ends = found.reshape(2, 4, 3, *height.shape)
     ends = np.where(np.isfinite(ends).all(axis=(0, 2), keepdims=True), ends, np.nan)
     (first, _, a), (second, _, b) = ends.swapaxes(1, 2)
-    step = (np.abs(first - second) > _STEP * (a + b) * cell).any(axis=0)
-    gap = np.isnan(height) & (np.isfinite(first).sum(axis=0) >= 2) & (over_steps | ~step)
-    weight, between = (
-        np.nan_to_num(1.0 / (a + b)),
-        np.nan_to_num((first * b + second * a) / (a + b)),
-    )
+    known = np.isfinite(first)
+    step = np.abs(first - second) > _STEP * (a + b) * cell
+    smooth = known & ~step
+    enough = smooth.sum(axis=0) >= 2
+    gap = np.isnan(height) & (enough | (over_steps & (known.sum(axis=0) >= 2)))
+    weight, between = np.where(smooth, 1.0 / (a + b), 0.0), (first * b + second * a) / (a + b)
+    between = np.nan_to_num(between)
     with np.errstate(invalid="ignore"):
         filled = (weight * between).sum(axis=0) / weight.sum(axis=0)
         square = (weight * np.square(between - filled)).sum(axis=0) / weight.sum(axis=0)
     low, high = (f.reduce(ends[:, :, 0], axis=(0, 1)) for f in (np.fmin, np.fmax))
     wide = np.fmax.reduce(ends[:, :, 1], axis=(0, 1))
-    wide += np.where(step, 0.5 * (high - low), 2.0 * np.sqrt(square))
-    filled = np.where(gap, np.where(step, low, filled), height)
+    wide += np.where(step.any(axis=0), 0.5 * (high - low), 2.0 * np.sqrt(square))
+    filled = np.where(gap, np.where(enough, filled, low), height)
     return filled.astype(np.float32), np.where(gap, wide, sigma).astype(np.float32)
 
 

@@ -26,7 +26,6 @@ from rasterio.windows import Window
 from alice_survey.core.config import ReconstructConfig, WaterConfig
 from alice_survey.core.errors import ReconstructionError, warn
 from alice_survey.core.executor import Executor
-from alice_survey.core.frames import Array
 from alice_survey.core.records import MosaicRecord, PicturesRecord
 from alice_survey.core.run import progress
 from reconstruct.dense.dem import fill_gaps
@@ -395,18 +394,18 @@ def _bridge(dem: Path, sights: Path, frame: WorldFrame, executor: Executor, labe
     return paths[0]
 
 
-def _bridge_tile(dem: Path, window: Window) -> tuple[Window, Array]:
+def _bridge_tile(dem: Path, window: Window) -> tuple[Window, NDArray[np.float32]]:
     """Heights of a tile, and sigmas of those that are interpolated, 0 of others, (2, H, W)."""
     rim = _BRIDGED_CELLS
     place = int(window.row_off) - rim, int(window.col_off) - rim
     size = int(window.height) + 2 * rim, int(window.width) + 2 * rim
     height, sigma, count = (
-        read_cells(dem.with_name(f"{name}.tif"), *place, *size)
+        read_cells(dem.with_name(f"{name}.tif"), *place, *size).astype(np.float32)
         for name in ("dem", "sigma", "count")
     )
     if np.isnan(height).any():
         height, sigma = fill_gaps(height, sigma, rim, grid_of(dem).cell, over_steps=True)
-    bands = np.stack([height, np.where(count > 0, 0.0, sigma)]).astype(np.float32)
+    bands = np.stack([height, np.where(count > 0, np.float32(0), sigma)])
     return window, bands[:, rim:-rim, rim:-rim]
 
 

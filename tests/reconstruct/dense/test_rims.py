@@ -44,6 +44,7 @@ def test_heights_are_those_seen_from_above_within_their_sigmas(workspace: Path) 
 def test_all_that_any_picture_shows_is_painted(workspace: Path) -> None:
     assert spec("mosaic").make(workspace, CONFIG, SERIAL)
     rgba, north, east = read_raster(workspace / "mosaic" / "mosaic.tif", None)
+    assert SCENE.cast is not None
     floor = np.stack([north, east, SCENE.depth_of(north, east)], axis=-1)
     shown = np.zeros(north.shape, bool)
     for view in VIEWS:
