@@ -114,7 +114,7 @@ def _projected(
     edge_on = math.cos(math.radians(80.0))
     away, normal = (points["enu"][:, :2] - middle) / grid.cell, points["normal"].astype(float)
     share = np.maximum(1 - np.abs(away), 0.0).prod(axis=1)
-    wall = (np.abs(normal[:, 2]) < edge_on) & (np.abs(away).max(axis=1) <= 0.75)
+    wall = (np.abs(normal[:, 2]) < edge_on) & (np.abs(away).max(axis=1) <= 0.5)
     near = (normal[:, 2] >= edge_on) & (share > 1e-3)
     foot, wall_top = (
         f(points["enu"][wall, 2], initial=x) for f, x in ((np.min, np.inf), (np.max, -np.inf))
@@ -230,32 +230,24 @@ def boulder_scene(seed: int) -> Scene:
     """Three boulders and a thin ledge that leans over the floor, as triangles traced by open3d."""
     import open3d as o3d
 
-    rng, line = np.random.default_rng(seed), np.linspace(-1.5, 2.5, 161)
-    north, east = np.meshgrid(line, line, indexing="ij")
-    floor = 0.05 * north - 0.03 * east + 0.02 * np.sin(5 * north + seed) * np.sin(4 * east)
-    mesh = o3d.geometry.TriangleMesh
-    corner = np.arange(161 * 160).reshape(160, 161)[:, :-1, None]
-    triangles = np.concatenate(
-        [corner + np.array(one) for one in ((0, 161, 162), (0, 162, 1))]
-    ).reshape(-1, 3)
-    parts = [(np.stack([north, east, floor], axis=-1).reshape(-1, 3), triangles)]
-    places = ((0.15, 0.2, -0.07), (0.6, 0.45, -0.06), (0.2, 0.72, -0.05))
-    for place, radius, squash in zip(places, (0.17, 0.12, 0.09), (0.7, 0.9, 0.8), strict=True):
+    mesh, parts = o3d.geometry.TriangleMesh, []
+    for size, middle, turn_deg in (
+        ((5, 5, 0.1), (0.4, 0.4, 0.05), (20, 2, -3)),
+        ((0.3, 0.3, 0.03), (0.6, 0.0, -0.2), (15 + 20 * seed, 4, 3)),
+    ):
+        box = mesh.create_box(*size).translate(np.array(middle), relative=False)
+        turn = Rotation.from_euler("ZYX", turn_deg, degrees=True).as_matrix()
+        parts.append(box.rotate(turn, center=np.array(middle)))
+    for radius, middle in ((0.17, (0.15, 0.2)), (0.12, (0.6, 0.45)), (0.09, (0.2, 0.72))):
         ball = mesh.create_sphere(radius, 40)
         corners = np.asarray(ball.vertices)
-        bumps = [size * np.sin(corners @ rng.normal(0, 1 / (size * 26 * radius), 3) * 9)
-                 for size in (0.12, 0.06)]  # fmt: skip
-        corners = corners * (1 + np.sum(bumps, axis=0))[:, None] * [1, 1, squash]
-        parts.append((corners + place, np.asarray(ball.triangles)))
-    ledge = mesh.create_box(0.3, 0.3, 0.03)
-    turn = Rotation.from_euler("ZYX", [15 + 20 * seed, 4, 3], degrees=True)
-    ledge.rotate(turn.as_matrix(), center=(0.15, 0.15, 0))
-    parts.append(
-        (np.asarray(ledge.vertices) + np.array([0.45, -0.15, -0.2]), np.asarray(ledge.triangles))
-    )
+        bumps = 1 + 0.12 * np.sin((corners + 0.03 * seed) @ [[2.0], [3.0], [1.0]] / radius)
+        ball.vertices = o3d.utility.Vector3dVector(corners * bumps * [1, 1, 0.8] + [*middle, -0.06])
+        parts.append(ball)
     solid = o3d.t.geometry.RaycastingScene()
-    for corners, faces in parts:
-        solid.add_triangles((corners + DEPTH_M * _DOWN).astype(np.float32), faces.astype(np.uint32))
+    for part in parts:
+        part.translate(DEPTH_M * _DOWN)
+        solid.add_triangles(o3d.t.geometry.TriangleMesh.from_legacy(part))
 
     def cast(starts: Array, rays: Array) -> Array:
         found = solid.cast_rays(np.concatenate([starts, rays], axis=-1).astype(np.float32))

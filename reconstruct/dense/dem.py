@@ -28,8 +28,6 @@ STRAY_CELLS = 8
 _MIN_COMPANY = 0.22
 """Share of that square that must be known: what is more isolated is a rim of a wall, mostly."""
 _MIN_WEIGHT = 1e-3
-_WALL_CELLS = 0.25
-"""A wall is within cells that it is nearer to than this, along both axes."""
 _BEYOND_RIM = 1.0 / math.sqrt(24.0 * math.pi)
 """Chance that the middle of a cell at a rim is beyond it: a rim that is anywhere between two
 middles is known to a cell, that is with a sigma of 1 / sqrt(12) of one."""
@@ -79,15 +77,12 @@ def cells_over(grid: DemGrid, surface: NDArray[Any]) -> FusedCells:
     column = (surface["enu"][:, 0].astype(np.float64) - grid.west) / grid.cell - 0.5
     row = (grid.north - surface["enu"][:, 1].astype(np.float64)) / grid.cell - 0.5
     facing = surface["normal"][:, 2] >= EDGE_ON
-    upright = np.abs(surface["normal"][:, 2]) < EDGE_ON
     foot, top = np.full((2, grid.rows, grid.columns), np.nan, np.float32)
-    for down in (-_WALL_CELLS, _WALL_CELLS):
-        for right in (-_WALL_CELLS, _WALL_CELLS):
-            r, c = np.rint(row[upright] + down), np.rint(column[upright] + right)
-            inside = (r >= 0) & (r < grid.rows) & (c >= 0) & (c < grid.columns)
-            at = r[inside].astype(np.int64), c[inside].astype(np.int64)
-            for extreme, ends in ((np.fmin, foot), (np.fmax, top)):
-                extreme.at(ends, at, surface["enu"][upright, 2][inside])
+    r, c = np.rint(row).astype(np.int64), np.rint(column).astype(np.int64)
+    upright = np.abs(surface["normal"][:, 2]) < EDGE_ON
+    upright &= (r >= 0) & (r < grid.rows) & (c >= 0) & (c < grid.columns)
+    for extreme, ends in ((np.fmin, foot), (np.fmax, top)):
+        extreme.at(ends, (r[upright], c[upright]), surface["enu"][upright, 2])
     surface, row, column = surface[facing], row[facing], column[facing]
     owner, point, weight = [], [], []
     for down in (0, 1):

@@ -88,7 +88,8 @@ from reconstruct.raster import (
 from reconstruct.views.model import SparseModel, WorldFrame, read_model, scaled_view
 
 _TILE_CELLS = 256
-_RIM = FILL_CELLS + STRAY_CELLS
+_RIM = FILL_CELLS + STRAY_CELLS + 3
+"""Beyond gaps: cells next to those that a rim is seen from, and next to walls."""
 
 
 def fuse_planes(
