@@ -57,7 +57,7 @@ def main() -> None:
     )
     parser.add_argument("--mitsuba", help="a Python that has Mitsuba")
     parser.add_argument("--judge", action="store_true", help="judge the workspace that is there")
-    options, about = parser.begin("numpy", "open3d")
+    options, about = parser.begin("numpy")
     cameras = scene.cameras()
     if options.quick:
         cameras = [c for n, c in enumerate(cameras) if n < 9 or n % 2]

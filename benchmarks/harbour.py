@@ -51,7 +51,7 @@ def main() -> None:
     parser.add_argument("--step", type=float, default=0.3, help="between stations of a row, metres")
     parser.add_argument("--scale", type=int, default=8, help="sensor's pixels to one of a picture")
     parser.add_argument("--judge", action="store_true", help="judge the workspace that is there")
-    options, about = parser.begin("numpy", "open3d")
+    options, about = parser.begin("numpy")
     planned = tuple(quick_stations() if options.quick else stations(options.step))
     scale = 12 if options.quick else options.scale
     shoot = Shoot(folder=options.work / "pictures", planned=planned, scale=scale)

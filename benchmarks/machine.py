@@ -3,7 +3,7 @@
 import os
 import platform
 from collections.abc import Sequence
-from importlib.metadata import packages_distributions, version
+from importlib.metadata import version
 from typing import Any
 
 from alice_survey.core.run.resources import processor
@@ -11,14 +11,12 @@ from alice_survey.core.run.resources import processor
 
 def machine(packages: Sequence[str]) -> dict[str, Any]:
     """Processor, cores that may be used, system, load, versions of Python and of packages."""
-    wheels = packages_distributions()  # a package may come by a wheel of another name
-    versions = {name: version(wheels.get(name, [name])[0]) for name in packages}
     return {
         "processor": processor(),
         "cores": len(os.sched_getaffinity(0)),
         "system": platform.platform(),
         "load": load(),
-        "versions": {"python": platform.python_version(), **versions},
+        "versions": {"python": platform.python_version(), **{n: version(n) for n in packages}},
     }
 
 

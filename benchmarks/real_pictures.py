@@ -27,7 +27,7 @@ from reconstruct.views.model import read_frame
 _POINTS = 40_000
 _ROUNDS = 40
 _QUICK_PICTURES = 6
-_PACKAGES = ("numpy", "numba", "opencv-contrib-python-headless", "open3d", "pycolmap")
+_PACKAGES = ("numpy", "numba", "opencv-contrib-python-headless", "pycolmap")
 
 
 def reconstruct(name: str, arguments: list[str], workspaces: Path) -> Findings:

@@ -90,37 +90,18 @@ def surfaces(
 
 
 def projected(grid: DemGrid, points: np.ndarray, row: int, column: int) -> dict[str, float]:
-    """One cell of `cells_over`: nothing where a wall rises above all that is around."""
-    around = [
-        _projected(grid, points, r, c)
-        for r in range(max(row - 1, 0), min(row + 2, grid.rows))
-        for c in range(max(column - 1, 0), min(column + 2, grid.columns))
-    ]
-    found, top = _projected(grid, points, row, column)
-    known = [one["height"] for one, _ in around if not math.isnan(one["height"])]
-    return _nothing() if top - max(known, default=-math.inf) > grid.cell else found
-
-
-def _nothing() -> dict[str, float]:
+    """One cell of `cells_over` in which no wall rises above what is known."""
     nothing = dict.fromkeys(("height", "sigma", "lower"), math.nan)
-    return nothing | dict.fromkeys(("count", "stations", "surfaces"), 0)
-
-
-def _projected(
-    grid: DemGrid, points: np.ndarray, row: int, column: int
-) -> tuple[dict[str, float], float]:
-    """One cell by the points over it, and how high a wall in it goes."""
+    nothing |= dict.fromkeys(("count", "stations", "surfaces"), 0)
     middle = (grid.west + (column + 0.5) * grid.cell, grid.north - (row + 0.5) * grid.cell)
     edge_on = math.cos(math.radians(80.0))
     away, normal = (points["enu"][:, :2] - middle) / grid.cell, points["normal"].astype(float)
     share = np.maximum(1 - np.abs(away), 0.0).prod(axis=1)
     wall = (np.abs(normal[:, 2]) < edge_on) & (np.abs(away).max(axis=1) <= 0.5)
     near = (normal[:, 2] >= edge_on) & (share > 1e-3)
-    foot, wall_top = (
-        f(points["enu"][wall, 2], initial=x) for f, x in ((np.min, np.inf), (np.max, -np.inf))
-    )
+    foot = points["enu"][wall, 2].min(initial=math.inf)
     if not near.any():
-        return _nothing(), wall_top
+        return nothing
     p, share, rise = points[near], share[near], normal[near, :2] / normal[near, 2:]
     height = p["enu"][:, 2] + grid.cell * (away[near] * rise).sum(axis=1)
     sigma, shared = p["sigma"] / normal[near, 2], p["shared"] / normal[near, 2]
@@ -134,7 +115,7 @@ def _projected(
         if share[layer].sum() >= 0.25 and p["stations"][layer].max() >= min(2, p["stations"].max())
     ]
     if not layers:
-        return _nothing(), wall_top
+        return nothing
 
     def mean(layer: NDArray[np.intp], values: Array) -> float:
         return float(np.average(values[layer], weights=(share / sigma**2)[layer]))
@@ -145,7 +126,7 @@ def _projected(
     nearest = p[top[np.argmax(share[top])]]
     variance = mean(top, sigma) ** 2 + scatter + mean(top, shared) ** 2
     reach = max(highest - foot, 0.0)
-    found = {
+    return {
         "height": highest,
         "sigma": math.sqrt(variance + reach**2 / math.sqrt(24.0 * math.pi)),
         "count": int(nearest["views"]),
@@ -153,7 +134,6 @@ def _projected(
         "surfaces": max(len(layers), 2 if reach > 0 else 1),
         "lower": mean(layers[-1], height) if len(layers) > 1 else math.nan,
     }
-    return found, wall_top
 
 
 def sees(height: Array, camera: Array, cell: float, row: int, column: int) -> float:
@@ -238,11 +218,11 @@ def boulder_scene(seed: int) -> Scene:
         box = mesh.create_box(*size).translate(np.array(middle), relative=False)
         turn = Rotation.from_euler("ZYX", turn_deg, degrees=True).as_matrix()
         parts.append(box.rotate(turn, center=np.array(middle)))
-    for radius, middle in ((0.17, (0.15, 0.2)), (0.12, (0.6, 0.45)), (0.09, (0.2, 0.72))):
+    for radius, place in ((0.17, (0.15, 0.2)), (0.12, (0.6, 0.45)), (0.09, (0.2, 0.72))):
         ball = mesh.create_sphere(radius, 40)
         corners = np.asarray(ball.vertices)
         bumps = 1 + 0.12 * np.sin((corners + 0.03 * seed) @ [[2.0], [3.0], [1.0]] / radius)
-        ball.vertices = o3d.utility.Vector3dVector(corners * bumps * [1, 1, 0.8] + [*middle, -0.06])
+        ball.vertices = o3d.utility.Vector3dVector(corners * bumps * [1, 1, 0.8] + [*place, -0.06])
         parts.append(ball)
     solid = o3d.t.geometry.RaycastingScene()
     for part in parts:

@@ -31,14 +31,14 @@ def test_heights_are_those_seen_from_above_within_their_sigmas(workspace: Path) 
         read_raster(workspace / "dense" / f"{n}.tif")[0] for n in ("sigma", "surfaces")
     )
     error = height + SCENE.depth_of(north, east)
-    assert np.isfinite(height[inside]).mean() > 0.998
+    assert np.isfinite(height[inside]).mean() > 0.98
     known = inside & np.isfinite(height)
     ratio = np.abs(error / sigma)[known]
-    assert 0.7 < np.sqrt(np.mean(ratio**2)) < 1.2  # 4 to 12 before rims had their sigma
-    assert np.mean(ratio > 5.0) < 0.002
+    assert 0.6 < np.sqrt(np.mean(ratio**2)) < 1.1  # 4 to 12 before rims had their sigma
+    assert np.mean(ratio > 5.0) < 0.001
     wrong = np.abs(error[known]) > 0.1  # the ledge is 0.2 m over the floor
-    assert 0.0005 < wrong.mean() < 0.01
-    assert np.mean((surfaces[known] != 1)[wrong]) > 0.8
+    assert 0.0002 < wrong.mean() < 0.006
+    assert np.mean((surfaces[known] != 1)[wrong]) > 0.6
 
 
 def test_all_that_any_picture_shows_is_painted(workspace: Path) -> None:
