@@ -52,6 +52,7 @@ BOUNDS = {
     "functions named by a participle": 0,
     "help texts with an avoided phrase": 0,
     "lines of docs with an avoided phrase": 0,
+    "sentences of docs over 35 words": 0,
 }
 """How large each count may be: these go down, never up."""
 _KERNEL = re.compile(r"(\w+\.)*(compiled|compiled_ieee|kernel|njit|jit)(\(.*)?", re.DOTALL)
@@ -238,14 +239,30 @@ def participles() -> list[str]:
 def avoided_in_docs() -> list[str]:
     """Lines of the documentation with a phrase that is not used."""
     phrases = re.compile("|".join(words()["docs"]["patterns"]), re.IGNORECASE)
-    pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
     return [
-        f"{path.relative_to(ROOT)}:{number}: {match[0]}"
-        for path in pages
-        if path.exists()
-        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1)
+        f"{where}:{number}: {match[0]}"
+        for where, text in _docs().items()
+        for number, line in enumerate(text.splitlines(), 1)
         for match in phrases.finditer(line)
     ]
+
+
+def long_sentences() -> list[str]:
+    """Sentences of the documentation over 35 words; code and a formula in a line are one word."""
+    found = []
+    for where, text in _docs().items():
+        plain = re.sub(r"(?ms)```.*?```|<!--.*?-->|\$\$.*?\$\$|^(?:\||#|    ).*?$", "", text)
+        plain = re.sub(r"`[^`]*`|\$[^$]*\$", "X", plain)
+        plain = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", plain)
+        for block in re.split(r"\n\s*\n|\n\s*(?:[-*]|\d+\.) ", plain):
+            sentences = re.split(r"(?<=[.!?:;])\s+(?=[A-Z\"(*])", " ".join(block.split()))
+            found += [f"{where}: {one}" for one in sentences if len(one.split()) > 35]
+    return found
+
+
+def _docs() -> dict[str, str]:
+    pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+    return {str(path.relative_to(ROOT)): path.read_text(encoding="utf-8") for path in pages}
 
 
 @cache
@@ -355,6 +372,7 @@ def counts() -> list[Count]:
         "functions named by a participle": participles(),
         "help texts with an avoided phrase": avoided_in_help(),
         "lines of docs with an avoided phrase": avoided_in_docs(),
+        "sentences of docs over 35 words": long_sentences(),
     }
     return [
         _lines("code lines of the packages", {name: m.text for name, m in modules().items()}),
