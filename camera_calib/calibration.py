@@ -48,6 +48,8 @@ class ErrorBudget:
     shared: Array
     """(P, M) factor of the part of it that other views of the same target have in common: errors of
     the priors' means and of the places of corners. The product with its transpose is that part."""
+    excess: float
+    """Variance of what the views determine over that by independent errors, mean of all."""
 
 
 @dataclass(frozen=True, kw_only=True)

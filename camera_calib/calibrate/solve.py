@@ -112,8 +112,16 @@ def calibrate(
     used = fitting[alive_views]
     left_out = np.where(kept[..., None], np.nan, pixels)[alive_views]
     final = tuple(_views_of(usable, fitting, alive_views, start))
-    problem = CalibrationProblem(used, points, start, freedom, shape)
-    spread = spread_of(problem, adjusted)
+    spread = spread_of(CalibrationProblem(used, points, start, freedom, shape), adjusted)
+    if freedom.prior.parameters:  # the views weigh as much against it as their correlated noise
+        excess = spread.excess
+        firm = replace(freedom, prior=freedom.prior.tighten(excess))
+        adjusted = adjust(
+            final, points, adjusted.rig, adjusted.rig_from_target, firm, blur=adjusted.blur,
+            shape=adjusted.shape,
+        )  # fmt: skip
+        problem = CalibrationProblem(used, points, start, firm, shape)
+        spread = spread_of(problem, adjusted, excess)
     rig = replace(
         adjusted.rig,
         source=f"{source} from {len(final)} views",
