@@ -54,9 +54,10 @@ class ErrorBudget:
 
 @dataclass(frozen=True, kw_only=True)
 class HousingTrial:
-    """How well the views fit one kind of port."""
+    """How well the views fit one kind of port and lens."""
 
     port: str
+    lens: str
     noise_px: float = math.nan
     criterion: float = math.inf
     """Schwarz's: the lower, the likelier."""
@@ -97,7 +98,7 @@ class Calibration:
     focal_ratios: Mapping[str, float] = field(default_factory=dict)
     """Of views under water as if without a housing, over those in air, by camera."""
     housing_trials: tuple[HousingTrial, ...] = ()
-    """All kinds of ports that were compared, if they were."""
+    """All kinds of ports and lenses that were compared, if they were."""
     spread: ErrorBudget | None = None
     """Noise of the corners and what follows of it; None if it was taken as independent."""
 

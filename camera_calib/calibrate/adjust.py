@@ -48,6 +48,10 @@ _POSE_DAMPING = 1e-6
 """Least damping of poses, whose parameters are never so similar."""
 
 
+class UnsettledError(CalibrationError):
+    """An adjustment ended at its guard, which says nothing about its model."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Adjustment:
     """The most likely rig and poses, with the residuals."""
@@ -217,7 +221,7 @@ class _Solver(CalibrationProblem):
                 "points leave what the camera model sees: start from values nearer to the truth, "
                 "such as another port distance"
             )
-        raise CalibrationError(
+        raise UnsettledError(
             f"the adjustment did not settle in {_STEPS} steps (the last moved by "
             f"{found.length:.2g} sigmas): take views at more angles and distances"
         )

@@ -10,7 +10,7 @@ import contextlib
 import math
 import shlex
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -30,6 +30,7 @@ from alice_survey.core.executor import Executor, local_executor
 from alice_survey.core.frames import Array
 from alice_survey.core.manifest import read_manifest
 from alice_survey.core.records import BoardRecord
+from camera_calib.calibrate.adjust import UnsettledError
 from camera_calib.calibrate.detect_views import Detections, Size, detect_views
 from camera_calib.calibrate.options import AUTO, CalibrateOptions, CalibrationTask, read_task
 from camera_calib.calibrate.picture_sets import (
@@ -40,6 +41,7 @@ from camera_calib.calibrate.picture_sets import (
 )
 from camera_calib.calibrate.results import calibration_text, warn_of_unseen, write_results
 from camera_calib.calibrate.solve import (
+    OUTLIER,
     Intrinsics,
     blank_camera,
     calibrate_in_air,
@@ -55,6 +57,8 @@ from camera_calib.rig import Rig, design_rig
 from camera_calib.stages import calibration_shortfall
 from camera_calib.targets.target import Target
 
+_UNUSUAL = 2.0 * math.log(1000.0)
+"""Criterion of a lens other than the usual one: it must be a thousand times likelier."""
 _MIN_FITTING = 0.5
 """Share of a camera's pictures that must fit those of the others."""
 
@@ -150,17 +154,11 @@ def calibrate_task(task: CalibrationTask, found: Detections) -> Calibration:
         CalibrationError: the views do not determine it, or are not of the start's cameras.
     """
     _check_sizes(task, found)
-    if not task.options.water:
-        cameras = task.cameras(found.sizes)
-        start = None if task.start is None else replace(task.start, cameras=cameras)
-        points = task.target.points
-        return calibrate_in_air(found.views, points, found.sizes, task.lenses, start, task.shape)
     ratios: dict[str, float] = {}
-    if task.start is not None:
+    if task.options.water and task.start is not None:
         ratios = focal_ratios(found.views, task.target.points, task.start, task.lenses)
     try:
-        through = _likeliest if AUTO in task.ports.values() else _through
-        calibration = through(task, found)
+        calibration = _likeliest(task, found)
     except CalibrationError as error:
         raise CalibrationError(f"{error}{_other_housing(ratios, task.ports)}") from None
     return replace(calibration, focal_ratios=ratios)
@@ -181,36 +179,87 @@ def _check_sizes(task: CalibrationTask, found: Detections) -> None:
             )
 
 
-def _through(task: CalibrationTask, found: Detections) -> Calibration:
-    """The calibration under water."""
+def _calibrate(task: CalibrationTask, found: Detections) -> Calibration:
+    """The calibration with the lenses and through the ports of a task."""
     points, views, shape = task.target.points, found.views, task.shape
     cameras = task.cameras(found.sizes)
+    start = None if task.start is None else replace(task.start, cameras=cameras)
+    if not task.options.water:
+        return calibrate_in_air(views, points, found.sizes, task.lenses, start, shape)
     sigmas = task.sigmas_of(cameras)
-    if task.start is None:
+    if start is None:
         return calibrate_in_water_alone(views, points, cameras, task.lenses, sigmas, shape)
-    start = replace(task.start, cameras=cameras)
     return calibrate_through_ports(views, points, start, task.known, task.lenses, sigmas, shape)
 
 
 def _likeliest(task: CalibrationTask, found: Detections) -> Calibration:
-    """The calibration through the likeliest housing, with how the others did."""
-    trials, calibrations = [], {}
-    for kind in PORTS:
+    """The calibration with the likeliest lens and housing, with how the others did.
+
+    Raises:
+        CalibrationError: none fits, or one of them did not settle and cannot be compared.
+    """
+    kinds = [
+        replace(task, ports=ports, lenses=lenses)
+        for ports in _kinds(task.ports, PORTS)
+        for lenses in _kinds(task.lenses, USUAL_LENS.values())
+    ]
+    if len(kinds) == 1:
+        return _calibrate(task, found)
+    trials, calibrations, unlikely = [], [], []
+    for one in kinds:
+        names = {"port": next(iter(one.ports.values())), "lens": next(iter(one.lenses.values()))}
         try:
-            one = _through(replace(task, ports=dict.fromkeys(found.sizes, kind)), found)
+            fit = _calibrate(one, found)
+        except UnsettledError as error:
+            raise CalibrationError(
+                f"{names['port']} with {names['lens']} cannot be compared: {error}"
+            ) from None
         except AliceError as error:
-            trials.append(HousingTrial(port=kind, why=str(error)))
+            trials.append(HousingTrial(**names, why=str(error)))
             continue
-        calibrations[kind] = one
-        coordinates = 2 * int(np.isfinite(one.residuals_px[..., 0]).sum())
+        calibrations.append(fit)
+        unlikely.append(0.0 if one.lenses == kinds[0].lenses else _UNUSUAL)
+        trials.append(HousingTrial(**names, noise_px=fit.noise_px))
+    if not calibrations:
+        reasons = dict.fromkeys(f"{one.port} with {one.lens}: {one.why}" for one in trials)
+        raise CalibrationError(f"no kind of camera fits the views: {'; '.join(reasons)}")
+    criteria = np.add(_criteria(calibrations), unlikely).tolist()
+    best = calibrations[int(np.argmin(criteria))]
+    values = iter(criteria)
+    scored = [one if one.why else replace(one, criterion=next(values)) for one in trials]
+    return replace(best, housing_trials=tuple(scored))
+
+
+def _kinds(chosen: Mapping[str, str], known: Iterable[str]) -> list[dict[str, str]]:
+    """What is chosen by camera, or each of all kinds for all cameras."""
+    if AUTO not in chosen.values():
+        return [dict(chosen)]
+    return [dict.fromkeys(chosen, kind) for kind in known]
+
+
+def _criteria(calibrations: Sequence[Calibration]) -> list[float]:
+    """Schwarz's criterion of each; correlated corners count as so many fewer.
+
+    A point that one leaves out and another does not counts as the outlier that it is, and a port
+    unlike those that are built as unlikely: a dome whose glass is at the pupil passes for flat.
+    """
+    coordinates = [2 * int(np.isfinite(one.residuals_px[..., 0]).sum()) for one in calibrations]
+    least = min(calibrations, key=lambda one: one.noise_px)
+    excess = 1.0 if least.spread is None else max(least.spread.excess, 1.0)
+    most, criteria = max(coordinates), []
+    for one, count in zip(calibrations, coordinates, strict=True):
         parameters = 0 if one.rig.covariance is None else len(one.rig.covariance.parameters)
-        criterion = 2.0 * coordinates * math.log(one.noise_px) + parameters * math.log(coordinates)
-        trials.append(HousingTrial(port=kind, noise_px=one.noise_px, criterion=criterion))
-    best = min(trials, key=lambda trial: trial.criterion).port
-    if best not in calibrations:
-        reasons = "; ".join(f"{trial.port}: {trial.why}" for trial in trials)
-        raise CalibrationError(f"no housing fits the views: {reasons}")
-    return replace(calibrations[best], housing_trials=tuple(trials))
+        misses = 2.0 * most * math.log(one.noise_px) + 0.5 * OUTLIER**2 * (most - count)
+        ports = [camera.port for camera in one.rig.cameras.values()]
+        unusual = [
+            (port.parameter(name) - port.guess().parameter(name)) / port.spreads[name]
+            for port in ports
+            for name in port.estimated
+            if name in port.spreads
+        ]
+        price = parameters * math.log(most / excess) + sum(np.square(unusual))
+        criteria.append(misses / excess + float(price))
+    return criteria
 
 
 def focal_ratios(

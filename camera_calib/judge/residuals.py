@@ -10,13 +10,16 @@
   moves is taken off first.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.polynomial import legendre
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform
+from scipy.special import stdtr
 
 from alice_survey.core.frames import Array
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
@@ -37,6 +40,8 @@ _FLAT_SHARE = 1e-6
 _OUTLYING = 6.0
 """Outlier limit of length over median length: 7 sigmas of normal noise."""
 _HALF_STEP_PX = 0.5
+_RINGS = 6
+"""Radial fields: as many as can be told from the usual lenses' four terms, and from one another."""
 _OUTER_SHARE = 0.7
 """Residuals beyond this share of the largest radius with points are compared with the others."""
 
@@ -206,17 +211,10 @@ class HomographyTest:
     """Radius at which outer points begin."""
     inner_count: int
     outer_count: int
-
-    @property
-    def excess_px(self) -> float:
-        """Excess of the outer residuals over the inner ones and chance (3 sigma); 0 if none.
-
-        The variance of n points, two coordinates each, has a relative sigma of 1 / sqrt(n).
-        """
-        if not self.outer_count:
-            return 0.0
-        chance = self.inner_px**2 * (1.0 + 3.0 / self.outer_count**0.5)
-        return float(max(self.outer_px**2 - chance, 0.0) ** 0.5)
+    p_value: float
+    """Probability that noise alone leaves as much at the same places of the frame."""
+    share: float
+    """Rms of that over the noise."""
 
 
 def homography_test(calibration: Calibration, camera: str) -> HomographyTest | None:
@@ -242,7 +240,9 @@ def homography_test(calibration: Calibration, camera: str) -> HomographyTest | N
     depths = np.concatenate([poses[v].apply(points[known[v]])[:, 2] for v in usable])
     warp = best_warp(model, float(depths.min()), float(depths.max()))
     fits = [_fit_view(warp, points[known[v]], measured[v, known[v]], poses[v]) for v in usable]
-    pixels, residuals, freedom = (np.concatenate(parts) for parts in zip(*fits, strict=True))
+    p_value, share = _repeated([model.cx_px, model.cy_px], fits)
+    pixels, residuals, taken, _ = (np.concatenate(parts) for parts in zip(*fits, strict=True))
+    freedom = 1.0 - (taken**2).sum(axis=1).reshape(-1, 2).mean(axis=1)
     radius = np.linalg.norm(pixels - [model.cx_px, model.cy_px], axis=1)
     outer_from = _OUTER_SHARE * float(radius.max())
     inner = radius < outer_from
@@ -253,23 +253,63 @@ def homography_test(calibration: Calibration, camera: str) -> HomographyTest | N
         outer_from_px=outer_from,
         inner_count=int(inner.sum()),
         outer_count=int((~inner).sum()),
+        p_value=p_value,
+        share=share,
     )
+
+
+def _repeated(centre: list[float], views: Sequence[tuple[Array, ...]]) -> tuple[float, float]:
+    """How likely noise leaves as much along one of some fields in view after view, and its share.
+
+    A wrong model pushes points of one place in the frame, and of one distance there, the same way
+    in all views; noise does not, however it goes together within a picture or grows outwards.
+    Student's test of each field's part in the views' residuals, at a level shared by the fields.
+
+    Args:
+        centre: principal point.
+        views: as `_fit_view` returns them.
+    """
+    away = [pixels - centre for pixels, *_ in views]
+    largest = max(float(np.linalg.norm(one, axis=1).max()) for one in away)
+    nearness = [1.0 / depth for *_, depth in views]
+    middle, spread = np.mean(np.concatenate(nearness)), np.std(np.concatenate(nearness))
+    parts, squares = np.zeros((2, len(views), _RINGS + 3))
+    noise_px = float(np.sqrt(np.median([(one[1] ** 2).mean() for one in views]))) + 1e-300
+    for v, (_, residuals, taken, _) in enumerate(views):
+        place = away[v] / largest
+        rings = legendre.legvander(2.0 * (place**2).sum(axis=1) - 1.0, _RINGS - 1)[:, 1:]
+        near = (nearness[v] - middle)[:, None] / max(spread, 1e-12)
+        sizes = np.concatenate([rings, place * rings[:, :1], near * rings[:, :2]], axis=1)
+        fields = (place[:, :, None] * sizes[:, None]).reshape(taken.shape[0], -1)
+        fields -= taken @ (taken.T @ fields)
+        parts[v] = residuals.ravel() @ fields / noise_px
+        squares[v] = (fields**2).sum(axis=0)
+    if len(views) < 2:
+        return 1.0, 0.0
+    total = squares.sum(axis=0)
+    size = parts.sum(axis=0) / total  # of each field, over the noise
+    off = (parts - size * squares) / np.sqrt(squares)
+    students = size * np.sqrt(total * (len(views) - 1) / (off**2).sum(axis=0))
+    tails = 2.0 * stdtr(len(views) - 1, -np.abs(students))
+    shares = np.abs(size) * np.sqrt(total / sum(len(one) for one in away))
+    worst = int(np.argmin(tails))
+    return min(float(tails[worst]) * len(tails), 1.0), float(shares[worst])
 
 
 def _fit_view(
     warp: PinholeWarp, target_points: Array, pixels: Array, cam_from_target: RigidTransform
-) -> tuple[Array, Array, Array]:
-    """Pixels and their `homography_residuals`, once outliers are set aside.
+) -> tuple[Array, Array, Array, Array]:
+    """Pixels, their `homography_residuals` and depths, once outliers are set aside.
 
     Outliers are found by the homography, not by the calibration's residuals: what its model cannot
     fit must not hide here.
     """
     while True:
-        residuals, freedom = homography_residuals(warp, target_points, pixels, cam_from_target)
+        residuals, taken = homography_residuals(warp, target_points, pixels, cam_from_target)
         length = np.linalg.norm(residuals, axis=1)
         stay = length <= _OUTLYING * float(np.median(length))
         if stay.all() or stay.sum() < _MIN_POINTS:
-            return pixels, residuals, freedom
+            return pixels, residuals, taken, cam_from_target.apply(target_points)[:, 2]
         target_points, pixels = target_points[stay], pixels[stay]
 
 
@@ -290,8 +330,8 @@ def homography_residuals(
         cam_from_target: gives the distances of the points.
 
     Returns:
-        Residuals (N, 2), fitted minus measured, in the camera's pixels; and (N,) the share of the
-        noise's variance that the fit leaves in each (1 minus its leverage).
+        Residuals (N, 2), fitted minus measured, in the camera's pixels; and (2 N, 8) orthonormal
+        directions of these that the fit takes up.
     """
     depth = cam_from_target.apply(target_points)[:, 2]
     seen = warp.to_pinhole(pixels, depth)
@@ -317,8 +357,7 @@ def homography_residuals(
 
     start = np.ravel(cv2.findHomography(plane, (seen - centre) / size)[0])[:8]
     found = least_squares(misfit, start, slopes, method="lm", xtol=1e-14, ftol=1e-15, gtol=1e-15)
-    leverage = (np.linalg.qr(slopes(found.x))[0] ** 2).sum(axis=1).reshape(-1, 2).mean(axis=1)
-    return found.fun.reshape(-1, 2), 1.0 - leverage
+    return found.fun.reshape(-1, 2), np.linalg.qr(slopes(found.x))[0]
 
 
 def _plane_coordinates(points: Array) -> Array:
