@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -95,8 +95,6 @@ class Calibration:
     """(V, cameras) noise of each picture over `noise_px`; None if all are equal."""
     shape: TargetShape = AS_DRAWN
     """How the target differs from its drawing: part of `target_points`."""
-    focal_ratios: Mapping[str, float] = field(default_factory=dict)
-    """Of views under water as if without a housing, over those in air, by camera."""
     housing_trials: tuple[HousingTrial, ...] = ()
     """All kinds of ports and lenses that were compared, if they were."""
     spread: ErrorBudget | None = None

@@ -283,10 +283,6 @@ class Prior:
             covariance=rig.covariance.marginal(kept).matrix,
         )
 
-    def tighten(self, times: float) -> "Prior":
-        """The same with a covariance so many times smaller."""
-        return replace(self, covariance=self.covariance / times)
-
     def and_also(self, other: "Prior") -> "Prior":
         """Both, taken as independent of each other."""
         twice = set(self.parameters) & set(other.parameters)

@@ -129,6 +129,8 @@ class _Solver(CalibrationProblem):
 
     blur: Array = np.ones((1, 1, 1))
     """(V, C, 1) noise of each picture over `noise_px`."""
+    scales: tuple[float, ...] = ()
+    """The last two of the loss."""
 
     def seen_from(self, state: State) -> _TargetGuess:
         """A guess with its residuals."""
@@ -147,6 +149,7 @@ class _Solver(CalibrationProblem):
 
     def linearise(self, guess: _TargetGuess, noise: Array) -> Equations:
         """Normal equations with Huber's weights."""
+        self.scales = (*self.scales[-1:], float(noise[0]))
         weights = self.weights(guess, noise)
         return self.equations(guess.state, weights / (noise * self.blur) ** 2)
 
@@ -160,7 +163,7 @@ class _Solver(CalibrationProblem):
         Raises:
             CalibrationError: the cost bends so much along the step that it needs more damping.
         """
-        noise, shared, poses = self.noise(guess), step.shared, step.poses
+        noise, shared, poses = np.array(self.scales[-1:]), step.shared, step.poses
         before, share = self.cost(guess, noise), 1.0
         for _ in range(2):
             part = replace(step, poses=share * poses, shared=share * shared)
@@ -184,9 +187,14 @@ class _Solver(CalibrationProblem):
         return coordinates - len(self.names) - 6 * len(self.pixels)
 
     def noise(self, guess: _TargetGuess) -> Array:
-        """(1,) sigma of a coordinate from the median length of the residuals."""
+        """(1,) sigma of a coordinate from the median length of the residuals.
+
+        A wrong model and its median can chase each other in a cycle; what turns back goes halfway.
+        """
         share = math.sqrt(2 * int(self.seen.sum()) / self.spare)
         sigma_px = float(np.median(guess.lengths[self.seen])) / RAYLEIGH_MEDIAN * share
+        if len(self.scales) > 1 and (sigma_px - self.scales[1]) * np.diff(self.scales)[0] < 0.0:
+            sigma_px = math.sqrt(sigma_px * self.scales[1])
         return np.array([max(sigma_px, _MIN_NOISE_PX)])
 
     def solve(self, state: State, settled: float, at_most: int | None) -> Adjustment:
@@ -196,7 +204,7 @@ class _Solver(CalibrationProblem):
                 f"{int(self.seen.sum())} measured points in {len(self.pixels)} views are too few "
                 f"for {len(self.names)} parameters and the poses: take more views"
             )
-        start = self.seen_from(state)
+        start, self.scales = self.seen_from(state), ()
         lost = self.seen & ~np.isfinite(start.residuals).all(axis=-1)
         if lost.any():  # points that the start cannot project take part once it has improved
             self.seen = self.seen & ~lost

@@ -1,9 +1,8 @@
 """Calibrate from pictures of a target: `alice-survey calibrate --left ... --right ...`, or pool.
 
-A flat port makes focal lengths the water's index times longer than in air, a dome about its pupil
-leaves them as they are. Where both calibrations exist, their ratio shows a wrong housing at once.
-Else each housing is calibrated in turn, and the noise that each leaves is compared, with a price
-for every parameter (G. Schwarz 1978, "Estimating the dimension of a model").
+Where the lens or the housing is to be found, each is calibrated in turn, and the noise that each
+leaves is compared, with a price for every parameter (G. Schwarz 1978, "Estimating the dimension of
+a model").
 """
 
 import contextlib
@@ -27,7 +26,6 @@ from alice_survey.core.artefacts import (
 from alice_survey.core.config import CameraConfig, WaterConfig
 from alice_survey.core.errors import AliceError, CalibrationError, offer
 from alice_survey.core.executor import Executor, local_executor
-from alice_survey.core.frames import Array
 from alice_survey.core.manifest import read_manifest
 from alice_survey.core.records import BoardRecord
 from camera_calib.calibrate.adjust import UnsettledError
@@ -43,17 +41,15 @@ from camera_calib.calibrate.results import calibration_text, warn_of_unseen, wri
 from camera_calib.calibrate.solve import (
     OUTLIER,
     Intrinsics,
-    blank_camera,
     calibrate_in_air,
     calibrate_in_water_alone,
     calibrate_through_ports,
-    first_cameras,
 )
-from camera_calib.calibration import Calibration, HousingTrial, TargetView
-from camera_calib.freedom import USUAL_LENS, LensNames, lens_of
+from camera_calib.calibration import Calibration, HousingTrial
+from camera_calib.freedom import USUAL_LENS
 from camera_calib.mount import mount_line, with_mount
-from camera_calib.optics import PORTS, contradicting_port
-from camera_calib.rig import Rig, design_rig
+from camera_calib.optics import PORTS
+from camera_calib.rig import design_rig
 from camera_calib.stages import calibration_shortfall
 from camera_calib.targets.target import Target
 
@@ -154,14 +150,7 @@ def calibrate_task(task: CalibrationTask, found: Detections) -> Calibration:
         CalibrationError: the views do not determine it, or are not of the start's cameras.
     """
     _check_sizes(task, found)
-    ratios: dict[str, float] = {}
-    if task.options.water and task.start is not None:
-        ratios = focal_ratios(found.views, task.target.points, task.start, task.lenses)
-    try:
-        calibration = _likeliest(task, found)
-    except CalibrationError as error:
-        raise CalibrationError(f"{error}{_other_housing(ratios, task.ports)}") from None
-    return replace(calibration, focal_ratios=ratios)
+    return _likeliest(task, found)
 
 
 def _check_sizes(task: CalibrationTask, found: Detections) -> None:
@@ -210,10 +199,8 @@ def _likeliest(task: CalibrationTask, found: Detections) -> Calibration:
         names = {"port": next(iter(one.ports.values())), "lens": next(iter(one.lenses.values()))}
         try:
             fit = _calibrate(one, found)
-        except UnsettledError as error:
-            raise CalibrationError(
-                f"{names['port']} with {names['lens']} cannot be compared: {error}"
-            ) from None
+        except UnsettledError:
+            raise
         except AliceError as error:
             trials.append(HousingTrial(**names, why=str(error)))
             continue
@@ -249,52 +236,14 @@ def _criteria(calibrations: Sequence[Calibration]) -> list[float]:
     most, criteria = max(coordinates), []
     for one, count in zip(calibrations, coordinates, strict=True):
         parameters = 0 if one.rig.covariance is None else len(one.rig.covariance.parameters)
-        misses = 2.0 * most * math.log(one.noise_px) + 0.5 * OUTLIER**2 * (most - count)
-        ports = [camera.port for camera in one.rig.cameras.values()]
-        unusual = [
-            (port.parameter(name) - port.guess().parameter(name)) / port.spreads[name]
-            for port in ports
-            for name in port.estimated
-            if name in port.spreads
-        ]
-        price = parameters * math.log(most / excess) + sum(np.square(unusual))
-        criteria.append(misses / excess + float(price))
-    return criteria
-
-
-def focal_ratios(
-    views: Sequence[TargetView], points: Array, in_air: Rig, lens: LensNames
-) -> dict[str, float]:
-    """Focal lengths under water, as if without a housing, over those in air, by camera.
-
-    Args:
-        views: under water.
-        points: (N, 3) of the target, metres.
-        in_air: calibrated in air.
-        lens: name of a lens model, of all cameras or by camera.
-    """
-    blank = {
-        name: blank_camera((camera.width_px, camera.height_px), lens_of(lens, name))
-        for name, camera in in_air.cameras.items()
-    }
-    found = first_cameras(views, points, blank, lens)
-    return {
-        name: math.sqrt(
-            camera.fx_px * camera.fy_px / (in_air.cameras[name].fx_px * in_air.cameras[name].fy_px)
+        cost = 2.0 * most * math.log(one.noise_px) + 0.5 * OUTLIER**2 * (most - count)
+        unusual = sum(
+            ((port.parameter(name) - port.guess().parameter(name)) / port.spreads[name]) ** 2
+            for port in (camera.port for camera in one.rig.cameras.values())
+            for name in port.spreads.keys() & {*port.estimated}
         )
-        for name, camera in found.items()
-    }
-
-
-def _other_housing(ratios: Mapping[str, float], kinds: Mapping[str, str]) -> str:
-    """What focal lengths say against the ports, for the end of a message."""
-    for name, ratio in ratios.items():
-        if likely := contradicting_port(ratio, kinds[name]):
-            return (
-                f"; focal lengths of {name} under water are {ratio:.3f} times those in air, which "
-                f"says --port {likely}"
-            )
-    return ""
+        criteria.append(cost / excess + parameters * math.log(most / excess) + unusual)
+    return criteria
 
 
 def run_calibrate(

@@ -114,14 +114,13 @@ def calibrate(
     final = tuple(_views_of(usable, fitting, alive_views, start))
     spread = spread_of(CalibrationProblem(used, points, start, freedom, shape), adjusted)
     if freedom.prior.parameters:  # the views weigh as much against it as their correlated noise
-        excess = spread.excess
-        firm = replace(freedom, prior=freedom.prior.tighten(excess))
+        excess, prior = spread.excess, freedom.prior
+        firm = replace(freedom, prior=replace(prior, covariance=prior.covariance / excess))
         adjusted = adjust(
             final, points, adjusted.rig, adjusted.rig_from_target, firm, blur=adjusted.blur,
             shape=adjusted.shape,
         )  # fmt: skip
-        problem = CalibrationProblem(used, points, start, firm, shape)
-        spread = spread_of(problem, adjusted, excess)
+        spread = spread_of(CalibrationProblem(used, points, start, firm, shape), adjusted, excess)
     rig = replace(
         adjusted.rig,
         source=f"{source} from {len(final)} views",

@@ -17,7 +17,6 @@ from alice_survey.kit.document import Level, Verdict, worst_first
 from alice_survey.kit.words import count, with_sigma
 from camera_calib.calibration import Calibration
 from camera_calib.judge import residuals, uncertainty, validation
-from camera_calib.optics import likely_port
 from camera_calib.target_shape import BOW_X, BOW_Y
 
 DESIGN_RANGE_M = 2.0
@@ -31,10 +30,6 @@ _HELD_OUT_LIMITS = 1.2, 2.0
 """Ratios above which a verdict is `look` and `bad`, here as in all pairs of limits."""
 _P_LOOK, _P_BAD = 1e-3, 1e-6
 """Levels of all tests: of an exact calibration, one verdict in a thousand is `look`."""
-_FRESH_WATER = 1.33
-_RATIO_OFF = 0.12
-"""Share by which a ratio of focal lengths may differ from what the port makes of it; domes are
-centred by hand, and a flat port's distance lengthens them a little."""
 _NEAREST_GLASS_M, _MAX_GLASS_M = 0.002, 0.25
 """Distance at which a port touches the lens, and the largest one of a housing."""
 _OPEN = 0.5
@@ -217,12 +212,11 @@ def _fit_verdicts(judged: Judgement) -> Iterator[Verdict]:
     yield from _outlier_verdicts(outliers, points, "points")
     for name, camera in judged.cameras.items():
         test = camera.homography
-        if test is not None and np.isfinite(test.outer_px):
+        if test is not None:
             yield _test(
                 test.p_value if test.share > _UNEVEN else max(test.p_value, _P_BAD),
-                f"{name}: homographies leave {test.inner_px:.3f} px within and "
-                f"{test.outer_px:.3f} px beyond {test.outer_from_px:.0f} px from the centre, of "
-                f"which {test.share:.2f} of the noise is the same in all views",
+                f"{name}: homographies leave {test.noise_px:.3f} px, of which {test.share:.2f} is "
+                "the same at one place of the frame in all views",
                 "; the model of lens or port does not fit",
             )
 
@@ -241,15 +235,6 @@ def _port_verdicts(judged: Judgement) -> Iterator[Verdict]:
     # Where housings were compared, what each leaves has decided already.
     compared = len({trial.port for trial in calibration.housing_trials}) > 1
     for name, camera in rig.cameras.items() if not compared else ():
-        ratio = calibration.focal_ratios.get(name)
-        if ratio is not None:
-            yield _grade(
-                abs(ratio / camera.port.magnification - 1.0), (_RATIO_OFF, _RATIO_OFF),
-                f"focal lengths of {name} under water are {ratio:.3f} times those in air: "
-                f"{max(camera.n_water, _FRESH_WATER):.3g} behind a flat port, near 1 behind a dome "
-                "or without a port",
-                f"; calibrate with --port {likely_port(ratio)}, or --port auto",
-            )  # fmt: skip
         spread_m = _SIGMAS * rig.sigmas.get(f"{name}.port_distance_m", np.inf)
         if np.isfinite(spread_m):
             distance_m = camera.parameter("port_distance_m")

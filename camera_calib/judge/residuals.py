@@ -42,8 +42,6 @@ _OUTLYING = 6.0
 _HALF_STEP_PX = 0.5
 _RINGS = 6
 """Radial fields: as many as can be told from the usual lenses' four terms, and from one another."""
-_OUTER_SHARE = 0.7
-"""Residuals beyond this share of the largest radius with points are compared with the others."""
 
 
 def within_gate(residuals_px: Array, noise_px: Array | float) -> NDArray[np.bool_]:
@@ -202,15 +200,9 @@ def points_by_cell(camera: Camera, pixels: Array) -> NDArray[np.intp]:
 class HomographyTest:
     """Homography residuals of one camera, over all views."""
 
-    views: int
-    inner_px: float
-    """Standard deviation of one coordinate of the inner points, by the degrees of freedom."""
-    outer_px: float
-    """The same of the outer points."""
-    outer_from_px: float
-    """Radius at which outer points begin."""
-    inner_count: int
-    outer_count: int
+    points: int
+    noise_px: float
+    """Standard deviation of one coordinate, by the degrees of freedom, median of the views."""
     p_value: float
     """Probability that noise alone leaves as much at the same places of the frame."""
     share: float
@@ -221,7 +213,7 @@ def homography_test(calibration: Calibration, camera: str) -> HomographyTest | N
     """Fit a homography to every view of one camera.
 
     Returns:
-        None where the target is not flat, or no view has enough points.
+        None where the target is not flat, or fewer than two views have enough points.
     """
     points = calibration.drawn_points
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
@@ -229,7 +221,7 @@ def homography_test(calibration: Calibration, camera: str) -> HomographyTest | N
     model = calibration.rig.cameras[camera]
     known = np.isfinite(calibration.residuals_px[:, index, :, 0])
     usable = np.nonzero(known.sum(axis=1) >= _MIN_POINTS)[0]
-    if spread[2] >= _FLAT_SHARE * spread[0] or not len(usable):
+    if spread[2] >= _FLAT_SHARE * spread[0] or len(usable) < 2:
         return None
     measured = stack_views(calibration.views, calibration.rig, len(points))[:, index]
     poses = [calibration.rig.cam_from_rig[camera] * pose for pose in calibration.rig_from_target]
@@ -240,25 +232,10 @@ def homography_test(calibration: Calibration, camera: str) -> HomographyTest | N
     depths = np.concatenate([poses[v].apply(points[known[v]])[:, 2] for v in usable])
     warp = best_warp(model, float(depths.min()), float(depths.max()))
     fits = [_fit_view(warp, points[known[v]], measured[v, known[v]], poses[v]) for v in usable]
-    p_value, share = _repeated([model.cx_px, model.cy_px], fits)
-    pixels, residuals, taken, _ = (np.concatenate(parts) for parts in zip(*fits, strict=True))
-    freedom = 1.0 - (taken**2).sum(axis=1).reshape(-1, 2).mean(axis=1)
-    radius = np.linalg.norm(pixels - [model.cx_px, model.cy_px], axis=1)
-    outer_from = _OUTER_SHARE * float(radius.max())
-    inner = radius < outer_from
-    return HomographyTest(
-        views=len(usable),
-        inner_px=_sigma(residuals[inner], freedom[inner]),
-        outer_px=_sigma(residuals[~inner], freedom[~inner]),
-        outer_from_px=outer_from,
-        inner_count=int(inner.sum()),
-        outer_count=int((~inner).sum()),
-        p_value=p_value,
-        share=share,
-    )
+    return _field_test(np.array([model.cx_px, model.cy_px]), fits)
 
 
-def _repeated(centre: list[float], views: Sequence[tuple[Array, ...]]) -> tuple[float, float]:
+def _field_test(centre: Array, views: Sequence[tuple[Array, ...]]) -> HomographyTest:
     """How likely noise leaves as much along one of some fields in view after view, and its share.
 
     A wrong model pushes points of one place in the frame, and of one distance there, the same way
@@ -274,7 +251,8 @@ def _repeated(centre: list[float], views: Sequence[tuple[Array, ...]]) -> tuple[
     nearness = [1.0 / depth for *_, depth in views]
     middle, spread = np.mean(np.concatenate(nearness)), np.std(np.concatenate(nearness))
     parts, squares = np.zeros((2, len(views), _RINGS + 3))
-    noise_px = float(np.sqrt(np.median([(one[1] ** 2).mean() for one in views]))) + 1e-300
+    squares_px = [(one**2).sum() / (one.size - len(taken.T)) for _, one, taken, _ in views]
+    noise_px = float(np.sqrt(np.median(squares_px))) + 1e-300
     for v, (_, residuals, taken, _) in enumerate(views):
         place = away[v] / largest
         rings = legendre.legvander(2.0 * (place**2).sum(axis=1) - 1.0, _RINGS - 1)[:, 1:]
@@ -284,16 +262,18 @@ def _repeated(centre: list[float], views: Sequence[tuple[Array, ...]]) -> tuple[
         fields -= taken @ (taken.T @ fields)
         parts[v] = residuals.ravel() @ fields / noise_px
         squares[v] = (fields**2).sum(axis=0)
-    if len(views) < 2:
-        return 1.0, 0.0
-    total = squares.sum(axis=0)
+    total, points = squares.sum(axis=0), sum(len(one) for one in away)
     size = parts.sum(axis=0) / total  # of each field, over the noise
     off = (parts - size * squares) / np.sqrt(squares)
     students = size * np.sqrt(total * (len(views) - 1) / (off**2).sum(axis=0))
     tails = 2.0 * stdtr(len(views) - 1, -np.abs(students))
-    shares = np.abs(size) * np.sqrt(total / sum(len(one) for one in away))
     worst = int(np.argmin(tails))
-    return min(float(tails[worst]) * len(tails), 1.0), float(shares[worst])
+    return HomographyTest(
+        points=points,
+        noise_px=noise_px,
+        p_value=min(float(tails[worst]) * len(tails), 1.0),
+        share=float(abs(size[worst]) * np.sqrt(total[worst] / points)),
+    )
 
 
 def _fit_view(
@@ -311,11 +291,6 @@ def _fit_view(
         if stay.all() or stay.sum() < _MIN_POINTS:
             return pixels, residuals, taken, cam_from_target.apply(target_points)[:, 2]
         target_points, pixels = target_points[stay], pixels[stay]
-
-
-def _sigma(residuals: Array, freedom: Array) -> float:
-    total = float(freedom.sum())
-    return float(((residuals**2).mean(axis=1).sum() / total) ** 0.5) if total > 0 else float("nan")
 
 
 def homography_residuals(

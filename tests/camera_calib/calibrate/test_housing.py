@@ -54,14 +54,10 @@ def calibrated(options: CalibrateOptions, found: Detections) -> Calibration:
     return calibrate_task(task_of(options, places, TARGET, dry()), found)
 
 
-@pytest.mark.parametrize(
-    ("port", "kind", "ratio"), [(FLAT, "flat", 1.34), (CENTRED, "none", 1.0), (OFF, "dome", 0.98)]
-)
-def test_the_housing_is_found(port: PortValues, kind: str, ratio: float) -> None:
+@pytest.mark.parametrize(("port", "kind"), [(FLAT, "flat"), (CENTRED, "none"), (OFF, "dome")])
+def test_the_housing_is_found(port: PortValues, kind: str) -> None:
     found = calibrated(CalibrateOptions(water=True, port="auto", glass_mm="6"), through(port))
     assert {camera.port.shape for camera in found.rig.cameras.values()} == {kind}
-    for value in found.focal_ratios.values():
-        assert value == pytest.approx(ratio, abs=0.01)
     assert 0.8 * NOISE_PX < found.noise_px < 1.2 * NOISE_PX
     said = verdicts(judge(found, None))
     if kind == "dome":
@@ -73,7 +69,7 @@ def test_the_housing_is_found(port: PortValues, kind: str, ratio: float) -> None
     assert ("same camera" in text) == (kind == "none")
     fixed = [line for line in text.splitlines() if line.split()[1:3] == ["6", "(fixed)"]]
     assert len(fixed) == (0 if kind == "none" else len(TRUTH.cameras))
-    assert not [v for v in said if v.level == "bad" and "focal lengths" in v.text]
+    assert not [v for v in said if "--port auto" in v.text]
 
 
 BARE = CalibrateOptions(water=True, port="none")
@@ -83,8 +79,8 @@ BARE = CalibrateOptions(water=True, port="none")
 @pytest.mark.parametrize(
     ("options", "port", "named"),
     [
-        (CalibrateOptions(water=True, glass_mm="6"), CENTRED, "--port dome"),
-        (BARE, FLAT, "--port flat"),
+        (CalibrateOptions(water=True, glass_mm="6"), CENTRED, "--port auto"),
+        (BARE, FLAT, "--port auto"),
         (BARE, OFF, "from its prior"),
     ],
 )
