@@ -227,7 +227,7 @@ class _Solver(CalibrationProblem):
             raise CalibrationError(
                 f"the adjustment is stuck {found.length:.2g} sigmas from its end, where measured "
                 "points leave what the camera model sees: start from values nearer to the truth, "
-                "such as another port distance"
+                "such as another port, or another distance of it"
             )
         raise UnsettledError(
             f"the adjustment did not settle in {_STEPS} steps (the last moved by "

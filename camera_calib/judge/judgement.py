@@ -213,12 +213,19 @@ def _fit_verdicts(judged: Judgement) -> Iterator[Verdict]:
     for name, camera in judged.cameras.items():
         test = camera.homography
         if test is not None:
-            yield _test(
-                test.p_value if test.share > _UNEVEN else max(test.p_value, _P_BAD),
+            size = 1.0 if test.share <= _UNEVEN else 2.0  # a small misfit is not `bad`
+            yield _grade(
+                size if test.p_value < _P_LOOK else 0.0, (0.0, 1.0),
                 f"{name}: homographies leave {test.noise_px:.3f} px, of which {test.share:.2f} is "
-                "the same at one place of the frame in all views",
-                "; the model of lens or port does not fit",
-            )
+                f"the same at one place of the frame in all views (p = {test.p_value:.2g})",
+                f"; the model of lens or port does not fit{_port_advice(judged.calibration)}",
+            )  # fmt: skip
+
+
+def _port_advice(calibration: Calibration) -> str:
+    """The comparison of ports, for views under water that were not compared yet."""
+    compared = len({trial.port for trial in calibration.housing_trials}) > 1
+    return "" if compared or not calibration.freedom.prior.parameters else ": try --port auto"
 
 
 def _port_verdicts(judged: Judgement) -> Iterator[Verdict]:
@@ -245,11 +252,10 @@ def _port_verdicts(judged: Judgement) -> Iterator[Verdict]:
                     "where no housing has glass: the pictures are through a dome, without a port, "
                     "or in air; try --port auto"
                 )
-    advice = "--intrinsics free if the focus changed"
-    yield from _prior_verdicts(calibration, advice if compared else f"try --port auto, or {advice}")
+    yield from _prior_verdicts(calibration)
 
 
-def _prior_verdicts(calibration: Calibration, advice: str) -> Iterator[Verdict]:
+def _prior_verdicts(calibration: Calibration) -> Iterator[Verdict]:
     """Whether the views contradict what was known before, as a wrong kind of port makes them do.
 
     Of the prior's error d the result has a part K d. Its change by the views, whose own errors are
@@ -271,7 +277,8 @@ def _prior_verdicts(calibration: Calibration, advice: str) -> Iterator[Verdict]:
         min(2.0 * count * float(ndtr(-moved[largest])), 1.0),
         f"the views move {prior.parameters[largest]} by {moved[largest]:.1f} sigmas from its prior,"
         " more than any other parameter",
-        f": port, lens or water differ from the prior; {advice}",
+        f"; port, lens or water differ from the prior{_port_advice(calibration)}, or --intrinsics "
+        "free if the focus changed",
     )
 
 

@@ -79,7 +79,7 @@ BARE = CalibrateOptions(water=True, port="none")
 @pytest.mark.parametrize(
     ("options", "port", "named"),
     [
-        (CalibrateOptions(water=True, glass_mm="6"), CENTRED, "--port auto"),
+        (CalibrateOptions(water=True, glass_mm="6"), CENTRED, "another port"),
         (BARE, FLAT, "--port auto"),
         (BARE, OFF, "from its prior"),
     ],
