@@ -196,17 +196,17 @@ def _likeliest(task: CalibrationTask, found: Detections) -> Calibration:
         return _calibrate(task, found)
     trials, calibrations, unlikely = [], [], []
     for one in kinds:
-        names = {"port": next(iter(one.ports.values())), "lens": next(iter(one.lenses.values()))}
+        port, lens = next(iter(one.ports.values())), next(iter(one.lenses.values()))
         try:
             fit = _calibrate(one, found)
         except UnsettledError:
             raise
         except AliceError as error:
-            trials.append(HousingTrial(**names, why=str(error)))
+            trials.append(HousingTrial(port=port, lens=lens, why=str(error)))
             continue
         calibrations.append(fit)
         unlikely.append(0.0 if one.lenses == kinds[0].lenses else _UNUSUAL)
-        trials.append(HousingTrial(**names, noise_px=fit.noise_px))
+        trials.append(HousingTrial(port=port, lens=lens, noise_px=fit.noise_px))
     if not calibrations:
         reasons = dict.fromkeys(f"{one.port} with {one.lens}: {one.why}" for one in trials)
         raise CalibrationError(f"no kind of camera fits the views: {'; '.join(reasons)}")
