@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -128,7 +129,7 @@ def seen_by_tracing(
     return Detections(views=tuple(views), sizes={"camera": (1440, 1080)}, rejections=())
 
 
-def alone(found: Detections, start: Rig | None = None, **given: str) -> Calibration:
+def alone(found: Detections, start: Rig | None = None, **given: Any) -> Calibration:
     options = CalibrateOptions(water=start is not None, **given)
     return calibrate_task(task_of(options, {"camera": "x"}, SMALL, start), found)
 
