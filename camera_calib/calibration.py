@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -48,13 +48,16 @@ class ErrorBudget:
     shared: Array
     """(P, M) factor of the part of it that other views of the same target have in common: errors of
     the priors' means and of the places of corners. The product with its transpose is that part."""
+    excess: float
+    """Variance of what the views determine over that by independent errors, mean of all."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class HousingTrial:
-    """How well the views fit one kind of port."""
+    """How well the views fit one kind of port and lens."""
 
     port: str
+    lens: str
     noise_px: float = math.nan
     criterion: float = math.inf
     """Schwarz's: the lower, the likelier."""
@@ -92,10 +95,8 @@ class Calibration:
     """(V, cameras) noise of each picture over `noise_px`; None if all are equal."""
     shape: TargetShape = AS_DRAWN
     """How the target differs from its drawing: part of `target_points`."""
-    focal_ratios: Mapping[str, float] = field(default_factory=dict)
-    """Of views under water as if without a housing, over those in air, by camera."""
     housing_trials: tuple[HousingTrial, ...] = ()
-    """All kinds of ports that were compared, if they were."""
+    """All kinds of ports and lenses that were compared, if they were."""
     spread: ErrorBudget | None = None
     """Noise of the corners and what follows of it; None if it was taken as independent."""
 

@@ -21,8 +21,6 @@ from camera_calib.ports.values import PortValues
 
 LENSES: dict[str, type[LensValues]] = {lens.model: lens for lens in (OpenCVLens, FisheyeLens)}
 PORTS: dict[str, type[PortValues]] = {port.shape: port for port in (NoPort, FlatPort, DomePort)}
-_BETWEEN = 1.17
-"""Between the ratio of focal lengths of a dome, 1, and that of a flat port, the water's index."""
 _Kernel = Callable[..., Any]
 _OF_LENS: dict[type[LensValues], tuple[_Kernel, _Kernel, _Kernel]] = {
     OpenCVLens: (opencv.opencv_pixels, opencv.opencv_rays, opencv.opencv_slopes),
@@ -38,17 +36,6 @@ _OF_PORT: dict[type[PortValues], tuple[_Kernel, _Kernel, _Kernel]] = {
 """Rays in air of points, the inverse for rays, and slopes by points of those by rays."""
 _BLOCK = 4096
 """Points at a time: their rays stay in the processor's cache."""
-
-
-def likely_port(focal_ratio: float) -> str:
-    """The kind of port that makes focal lengths so many times longer under water than in air."""
-    return FlatPort.shape if focal_ratio > _BETWEEN else DomePort.shape
-
-
-def contradicting_port(focal_ratio: float, given: str) -> str | None:
-    """The shape that a ratio says where it contradicts the given one; a dome may pass for none."""
-    likely = likely_port(focal_ratio)
-    return likely if likely != given and FlatPort.shape in (likely, given) else None
 
 
 def _of_lens(lens: LensValues) -> tuple[_Kernel, _Kernel, _Kernel]:

@@ -1,5 +1,6 @@
 """Files of other programs that once failed, where they lie beside the checkout."""
 
+import csv
 from pathlib import Path
 
 import numpy as np
@@ -7,10 +8,15 @@ import pytest
 
 from alice_survey.core.config import AreaConfig
 from alice_survey.core.errors import PlanError, keep_warnings
-from alice_survey.core.frames import Datum
+from alice_survey.core.frames import Array, Datum
+from camera_calib.calibrate.detect_views import Detections
+from camera_calib.calibrate.from_pictures import calibrate_task
+from camera_calib.calibrate.options import CalibrateOptions, task_of
+from camera_calib.calibration import TargetView
 from camera_calib.formats.convert import Conversion, convert
 from camera_calib.formats.rigs import ReadOptions
 from camera_calib.rig import read_rig
+from camera_calib.targets.target import parse_target
 from missions.areas.bathymetry import read_bathymetry
 from missions.areas.survey import survey_area
 from reconstruct.pictures.importing import import_images
@@ -117,3 +123,24 @@ def test_calibrations(name: str, tmp_path: Path) -> None:
     assert len(rig.cameras) == (2 if name in pairs else 1)
     if len(rig.cameras) == 2:
         assert 0.05 < rig.baseline_m < 0.2
+
+
+@pytest.mark.slow
+def test_a_real_dome_is_found_by_all_views_by_halves_and_by_thirds() -> None:
+    """Its maker states 7.2 mm."""
+    folder, pixels = CASES / "real-dome-corners", dict[str, Array]()
+    for row in csv.DictReader((folder / "water_corners.csv").read_text().splitlines()):
+        seen = pixels.setdefault(row["view"], np.full((48, 2), np.nan))
+        seen[int(row["point"])] = float(row["x_px"]), float(row["y_px"])
+    whole = [TargetView(name=name, pixels={"camera": seen}) for name, seen in pixels.items()]
+    options = CalibrateOptions(
+        water=True, port="auto", dome_radius_mm="47.302", glass_mm="3.75", n_glass="1.495",
+        n_water="1.333",
+    )  # fmt: skip
+    target, start = parse_target("chessboard 8x6 30mm"), read_rig(folder / "air_rig.json")
+    task = task_of(options, {"camera": "x"}, target, start)
+    for part in (slice(None), slice(0, 37), slice(37, None), slice(0, None, 2), slice(2, None, 3)):
+        found = Detections(views=tuple(whole[part]), sizes={"camera": (1440, 1080)}, rejections=())
+        port = calibrate_task(task, found).rig.cameras["camera"].port
+        assert port.shape == "dome"
+        assert port.parameter("dome_z_m") == pytest.approx(-7.2e-3, abs=0.4e-3)

@@ -33,7 +33,12 @@ HUBER = 3.0
 """Length, in sigmas of a coordinate, beyond which a residual's influence is constant."""
 _MIN_NOISE_PX = 1e-6
 """Smallest noise: below it the rounding of projections shows."""
-_STEPS = 100
+_STEPS = 1000
+"""A guard: an adjustment ends by its own test, most in ten steps."""
+_AS_PREDICTED = 0.25
+"""Share of its gain that a step drops the cost by if it is not much too long; one half is exact."""
+_USELESS = 0.05
+"""Such a share below which a step is not taken."""
 _SETTLED = 1e-4
 _DAMPING = 1e-3
 """Of the first step."""
@@ -41,6 +46,10 @@ _MIN_DAMPING = 1e-13
 """Parameters of a rig can be so similar that more damping than this hides their difference."""
 _POSE_DAMPING = 1e-6
 """Least damping of poses, whose parameters are never so similar."""
+
+
+class UnsettledError(CalibrationError):
+    """An adjustment ended at its guard, which says nothing about its model."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -120,6 +129,8 @@ class _Solver(CalibrationProblem):
 
     blur: Array = np.ones((1, 1, 1))
     """(V, C, 1) noise of each picture over `noise_px`."""
+    scales: tuple[float, ...] = ()
+    """The last two of the loss."""
 
     def seen_from(self, state: State) -> _TargetGuess:
         """A guess with its residuals."""
@@ -138,12 +149,32 @@ class _Solver(CalibrationProblem):
 
     def linearise(self, guess: _TargetGuess, noise: Array) -> Equations:
         """Normal equations with Huber's weights."""
+        self.scales = (*self.scales[-1:], float(noise[0]))
         weights = self.weights(guess, noise)
         return self.equations(guess.state, weights / (noise * self.blur) ** 2)
 
     def move(self, guess: _TargetGuess, equations: Equations, step: BlockStep) -> _TargetGuess:
-        """The guess after a step."""
-        return self.seen_from(self.take_step(guess.state, step))
+        """The guess after a step, which is shortened where the curvature it left out is large.
+
+        Gauss and Newton's step along which the cost bends h times more than its equations say ends
+        h times too far: for h near 2 it jumps to and fro for ever, about as near to the end as
+        before. The least point of the parabola through slope and drop has no such factor.
+
+        Raises:
+            CalibrationError: the cost bends so much along the step that it needs more damping.
+        """
+        noise, shared, poses = np.array(self.scales[-1:]), step.shared, step.poses
+        before, share = self.cost(guess, noise), 1.0
+        for _ in range(2):
+            part = replace(step, poses=share * poses, shared=share * shared)
+            tried = self.seen_from(self.take_step(guess.state, part))
+            drop = before - self.cost(tried, noise)
+            if drop > _AS_PREDICTED * step.gain:
+                return tried
+            share = 0.5 * step.gain / (step.gain - drop)
+        if drop < _USELESS * step.gain:
+            raise CalibrationError(f"the step drops the cost by {drop:.2g} of {step.gain:.2g}")
+        return tried
 
     def at_bound(self, guess: _TargetGuess) -> Flags:
         """Parameters that have their least value."""
@@ -156,9 +187,14 @@ class _Solver(CalibrationProblem):
         return coordinates - len(self.names) - 6 * len(self.pixels)
 
     def noise(self, guess: _TargetGuess) -> Array:
-        """(1,) sigma of a coordinate from the median length of the residuals."""
+        """(1,) sigma of a coordinate from the median length of the residuals.
+
+        A wrong model and its median can chase each other in a cycle; what turns back goes halfway.
+        """
         share = math.sqrt(2 * int(self.seen.sum()) / self.spare)
         sigma_px = float(np.median(guess.lengths[self.seen])) / RAYLEIGH_MEDIAN * share
+        if len(self.scales) > 1 and (sigma_px - self.scales[1]) * np.diff(self.scales)[0] < 0.0:
+            sigma_px = math.sqrt(sigma_px * self.scales[1])
         return np.array([max(sigma_px, _MIN_NOISE_PX)])
 
     def solve(self, state: State, settled: float, at_most: int | None) -> Adjustment:
@@ -168,7 +204,7 @@ class _Solver(CalibrationProblem):
                 f"{int(self.seen.sum())} measured points in {len(self.pixels)} views are too few "
                 f"for {len(self.names)} parameters and the poses: take more views"
             )
-        start = self.seen_from(state)
+        start, self.scales = self.seen_from(state), ()
         lost = self.seen & ~np.isfinite(start.residuals).all(axis=-1)
         if lost.any():  # points that the start cannot project take part once it has improved
             self.seen = self.seen & ~lost
@@ -191,9 +227,9 @@ class _Solver(CalibrationProblem):
             raise CalibrationError(
                 f"the adjustment is stuck {found.length:.2g} sigmas from its end, where measured "
                 "points leave what the camera model sees: start from values nearer to the truth, "
-                "such as another port distance"
+                "such as another port, or another distance of it"
             )
-        raise CalibrationError(
+        raise UnsettledError(
             f"the adjustment did not settle in {_STEPS} steps (the last moved by "
             f"{found.length:.2g} sigmas): take views at more angles and distances"
         )

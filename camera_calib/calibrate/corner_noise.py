@@ -80,12 +80,15 @@ class _Weighted:
         self.missed -= np.einsum("vcnak,vk->vcna", self.poses, taken_px)
 
 
-def spread_of(problem: CalibrationProblem, found: Adjustment) -> ErrorBudget:
+def spread_of(
+    problem: CalibrationProblem, found: Adjustment, tightened: float = 1.0
+) -> ErrorBudget:
     """Estimate the noise from the residuals of an adjustment, and propagate it.
 
     Args:
         problem: whose pixels and parameters were adjusted.
         found: the result.
+        tightened: how many times too small the rig's prior was taken, as a variance.
     """
     rows = _Weighted(problem, found)
     diagonal_m = float(np.linalg.norm(np.ptp(problem.points, axis=0)))
@@ -109,8 +112,13 @@ def spread_of(problem: CalibrationProblem, found: Adjustment) -> ErrorBudget:
     at = problem.prior_at
     if at.size:
         known = np.linalg.cholesky(problem.prior_information)
+        known[:, : len(problem.freedom.prior.parameters)] *= tightened**0.5
         shared.append(found.covariance.matrix[:, at] @ known)
     factor = np.concatenate(shared, axis=1)
+    by_place = sum(
+        variance * float((products.by_place[:, axes] ** 2).sum())
+        for axes, variance in zip(_AXES, places, strict=True)
+    )
     matrix = root @ meat @ root.T + factor @ factor.T
     return ErrorBudget(
         noise=CornerNoise(
@@ -120,6 +128,7 @@ def spread_of(problem: CalibrationProblem, found: Adjustment) -> ErrorBudget:
         ),
         covariance=Covariance(parameters=problem.names, matrix=0.5 * (matrix + matrix.T)),
         shared=factor,
+        excess=float((np.trace(meat) + by_place) / np.trace(products.by_rig[0])),
     )
 
 

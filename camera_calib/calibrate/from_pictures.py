@@ -1,16 +1,15 @@
 """Calibrate from pictures of a target: `alice-survey calibrate --left ... --right ...`, or pool.
 
-A flat port makes focal lengths the water's index times longer than in air, a dome about its pupil
-leaves them as they are. Where both calibrations exist, their ratio shows a wrong housing at once.
-Else each housing is calibrated in turn, and the noise that each leaves is compared, with a price
-for every parameter (G. Schwarz 1978, "Estimating the dimension of a model").
+Where the lens or the housing is to be found, each is calibrated in turn, and the noise that each
+leaves is compared, with a price for every parameter (G. Schwarz 1978, "Estimating the dimension of
+a model").
 """
 
 import contextlib
 import math
 import shlex
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,9 +26,9 @@ from alice_survey.core.artefacts import (
 from alice_survey.core.config import CameraConfig, WaterConfig
 from alice_survey.core.errors import AliceError, CalibrationError, offer
 from alice_survey.core.executor import Executor, local_executor
-from alice_survey.core.frames import Array
 from alice_survey.core.manifest import read_manifest
 from alice_survey.core.records import BoardRecord
+from camera_calib.calibrate.adjust import UnsettledError
 from camera_calib.calibrate.detect_views import Detections, Size, detect_views
 from camera_calib.calibrate.options import AUTO, CalibrateOptions, CalibrationTask, read_task
 from camera_calib.calibrate.picture_sets import (
@@ -40,21 +39,22 @@ from camera_calib.calibrate.picture_sets import (
 )
 from camera_calib.calibrate.results import calibration_text, warn_of_unseen, write_results
 from camera_calib.calibrate.solve import (
+    OUTLIER,
     Intrinsics,
-    blank_camera,
     calibrate_in_air,
     calibrate_in_water_alone,
     calibrate_through_ports,
-    first_cameras,
 )
-from camera_calib.calibration import Calibration, HousingTrial, TargetView
-from camera_calib.freedom import USUAL_LENS, LensNames, lens_of
+from camera_calib.calibration import Calibration, HousingTrial
+from camera_calib.freedom import USUAL_LENS
 from camera_calib.mount import mount_line, with_mount
-from camera_calib.optics import PORTS, contradicting_port
-from camera_calib.rig import Rig, design_rig
+from camera_calib.optics import PORTS
+from camera_calib.rig import design_rig
 from camera_calib.stages import calibration_shortfall
 from camera_calib.targets.target import Target
 
+_UNUSUAL = 2.0 * math.log(1000.0)
+"""Criterion of a lens other than the usual one: it must be a thousand times likelier."""
 _MIN_FITTING = 0.5
 """Share of a camera's pictures that must fit those of the others."""
 
@@ -150,20 +150,7 @@ def calibrate_task(task: CalibrationTask, found: Detections) -> Calibration:
         CalibrationError: the views do not determine it, or are not of the start's cameras.
     """
     _check_sizes(task, found)
-    if not task.options.water:
-        cameras = task.cameras(found.sizes)
-        start = None if task.start is None else replace(task.start, cameras=cameras)
-        points = task.target.points
-        return calibrate_in_air(found.views, points, found.sizes, task.lenses, start, task.shape)
-    ratios: dict[str, float] = {}
-    if task.start is not None:
-        ratios = focal_ratios(found.views, task.target.points, task.start, task.lenses)
-    try:
-        through = _likeliest if AUTO in task.ports.values() else _through
-        calibration = through(task, found)
-    except CalibrationError as error:
-        raise CalibrationError(f"{error}{_other_housing(ratios, task.ports)}") from None
-    return replace(calibration, focal_ratios=ratios)
+    return _likeliest(task, found)
 
 
 def _check_sizes(task: CalibrationTask, found: Detections) -> None:
@@ -181,71 +168,82 @@ def _check_sizes(task: CalibrationTask, found: Detections) -> None:
             )
 
 
-def _through(task: CalibrationTask, found: Detections) -> Calibration:
-    """The calibration under water."""
+def _calibrate(task: CalibrationTask, found: Detections) -> Calibration:
+    """The calibration with the lenses and through the ports of a task."""
     points, views, shape = task.target.points, found.views, task.shape
     cameras = task.cameras(found.sizes)
+    start = None if task.start is None else replace(task.start, cameras=cameras)
+    if not task.options.water:
+        return calibrate_in_air(views, points, found.sizes, task.lenses, start, shape)
     sigmas = task.sigmas_of(cameras)
-    if task.start is None:
+    if start is None:
         return calibrate_in_water_alone(views, points, cameras, task.lenses, sigmas, shape)
-    start = replace(task.start, cameras=cameras)
     return calibrate_through_ports(views, points, start, task.known, task.lenses, sigmas, shape)
 
 
 def _likeliest(task: CalibrationTask, found: Detections) -> Calibration:
-    """The calibration through the likeliest housing, with how the others did."""
-    trials, calibrations = [], {}
-    for kind in PORTS:
-        try:
-            one = _through(replace(task, ports=dict.fromkeys(found.sizes, kind)), found)
-        except AliceError as error:
-            trials.append(HousingTrial(port=kind, why=str(error)))
-            continue
-        calibrations[kind] = one
-        coordinates = 2 * int(np.isfinite(one.residuals_px[..., 0]).sum())
-        parameters = 0 if one.rig.covariance is None else len(one.rig.covariance.parameters)
-        criterion = 2.0 * coordinates * math.log(one.noise_px) + parameters * math.log(coordinates)
-        trials.append(HousingTrial(port=kind, noise_px=one.noise_px, criterion=criterion))
-    best = min(trials, key=lambda trial: trial.criterion).port
-    if best not in calibrations:
-        reasons = "; ".join(f"{trial.port}: {trial.why}" for trial in trials)
-        raise CalibrationError(f"no housing fits the views: {reasons}")
-    return replace(calibrations[best], housing_trials=tuple(trials))
+    """The calibration with the likeliest lens and housing, with how the others did.
 
-
-def focal_ratios(
-    views: Sequence[TargetView], points: Array, in_air: Rig, lens: LensNames
-) -> dict[str, float]:
-    """Focal lengths under water, as if without a housing, over those in air, by camera.
-
-    Args:
-        views: under water.
-        points: (N, 3) of the target, metres.
-        in_air: calibrated in air.
-        lens: name of a lens model, of all cameras or by camera.
+    Raises:
+        CalibrationError: none fits, or one of them did not settle and cannot be compared.
     """
-    blank = {
-        name: blank_camera((camera.width_px, camera.height_px), lens_of(lens, name))
-        for name, camera in in_air.cameras.items()
-    }
-    found = first_cameras(views, points, blank, lens)
-    return {
-        name: math.sqrt(
-            camera.fx_px * camera.fy_px / (in_air.cameras[name].fx_px * in_air.cameras[name].fy_px)
+    kinds = [
+        replace(task, ports=ports, lenses=lenses)
+        for ports in _kinds(task.ports, PORTS)
+        for lenses in _kinds(task.lenses, USUAL_LENS.values())
+    ]
+    if len(kinds) == 1:
+        return _calibrate(task, found)
+    trials, calibrations, unlikely = [], [], []
+    for one in kinds:
+        port, lens = next(iter(one.ports.values())), next(iter(one.lenses.values()))
+        try:
+            fit = _calibrate(one, found)
+        except UnsettledError:
+            raise
+        except AliceError as error:
+            trials.append(HousingTrial(port=port, lens=lens, why=str(error)))
+            continue
+        calibrations.append(fit)
+        unlikely.append(0.0 if one.lenses == kinds[0].lenses else _UNUSUAL)
+        trials.append(HousingTrial(port=port, lens=lens, noise_px=fit.noise_px))
+    if not calibrations:
+        reasons = dict.fromkeys(f"{one.port} with {one.lens}: {one.why}" for one in trials)
+        raise CalibrationError(f"no kind of camera fits the views: {'; '.join(reasons)}")
+    criteria = np.add(_criteria(calibrations), unlikely).tolist()
+    best = calibrations[int(np.argmin(criteria))]
+    values = iter(criteria)
+    scored = [one if one.why else replace(one, criterion=next(values)) for one in trials]
+    return replace(best, housing_trials=tuple(scored))
+
+
+def _kinds(chosen: Mapping[str, str], known: Iterable[str]) -> list[dict[str, str]]:
+    """What is chosen by camera, or each of all kinds for all cameras."""
+    if AUTO not in chosen.values():
+        return [dict(chosen)]
+    return [dict.fromkeys(chosen, kind) for kind in known]
+
+
+def _criteria(calibrations: Sequence[Calibration]) -> list[float]:
+    """Schwarz's criterion of each; correlated corners count as so many fewer.
+
+    A point that one leaves out and another does not counts as the outlier that it is, and a port
+    unlike those that are built as unlikely: a dome whose glass is at the pupil passes for flat.
+    """
+    coordinates = [2 * int(np.isfinite(one.residuals_px[..., 0]).sum()) for one in calibrations]
+    least = min(calibrations, key=lambda one: one.noise_px)
+    excess = 1.0 if least.spread is None else max(least.spread.excess, 1.0)
+    most, criteria = max(coordinates), []
+    for one, count in zip(calibrations, coordinates, strict=True):
+        parameters = 0 if one.rig.covariance is None else len(one.rig.covariance.parameters)
+        cost = 2.0 * most * math.log(one.noise_px) + 0.5 * OUTLIER**2 * (most - count)
+        unusual = sum(
+            ((port.parameter(name) - port.guess().parameter(name)) / port.spreads[name]) ** 2
+            for port in (camera.port for camera in one.rig.cameras.values())
+            for name in port.spreads.keys() & {*port.estimated}
         )
-        for name, camera in found.items()
-    }
-
-
-def _other_housing(ratios: Mapping[str, float], kinds: Mapping[str, str]) -> str:
-    """What focal lengths say against the ports, for the end of a message."""
-    for name, ratio in ratios.items():
-        if likely := contradicting_port(ratio, kinds[name]):
-            return (
-                f"; focal lengths of {name} under water are {ratio:.3f} times those in air, which "
-                f"says --port {likely}"
-            )
-    return ""
+        criteria.append(cost / excess + parameters * math.log(most / excess) + unusual)
+    return criteria
 
 
 def run_calibrate(

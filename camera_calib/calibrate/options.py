@@ -9,7 +9,6 @@ from alice_survey.core.errors import CalibrationError, WorkspaceError
 from camera_calib.calibrate.solve import Intrinsics, blank_camera
 from camera_calib.camera import Camera
 from camera_calib.freedom import LENSES, USUAL_LENS, part_of_rig
-from camera_calib.lenses.opencv import OpenCVLens
 from camera_calib.mount import MOUNTS, mount_pose
 from camera_calib.optics import PORTS
 from camera_calib.picture_files import places_of_cameras
@@ -21,7 +20,7 @@ from camera_calib.target_shape import AS_DRAWN, TargetShape, usual_shape
 from camera_calib.targets.target import Target, parse_target
 
 AUTO = "auto"
-"""The port that is found by trying all."""
+"""The port, or the lens, that is found by trying all."""
 WRITTEN = (
     "rig.json", "rig_carried.json", "calibration.json", "corners.csv", "report.html", "report.json",
 )  # fmt: skip
@@ -72,7 +71,7 @@ class CalibrationTask:
     """Folder or pattern of pictures by camera; the first is the reference."""
     target: Target
     lenses: Mapping[str, str]
-    """Lens model by camera, of `freedom.LENSES`."""
+    """Lens model by camera, of `freedom.LENSES`, or `AUTO` for all."""
     ports: Mapping[str, str]
     """Kind of port by camera, of `optics.PORTS`, or `AUTO` for all; in air none has a port."""
     port_values: Mapping[str, Mapping[str, float]]
@@ -206,11 +205,13 @@ def words_by_camera(text: str, cameras: Iterable[str], option: str) -> dict[str,
     return chosen
 
 
-def _kinds(
-    text: str, cameras: Iterable[str], option: str, known: Collection[str]
+def _auto_or_kinds(
+    text: str, cameras: Iterable[str], option: str, kinds: Collection[str]
 ) -> dict[str, str]:
-    """Words by camera that are names of some kind."""
-    chosen = words_by_camera(text, cameras, option)
+    """Words by camera that are names of some kind, or `AUTO` for all."""
+    chosen, known = words_by_camera(text, cameras, option), (*kinds, AUTO)
+    if AUTO in chosen.values() and len(set(chosen.values())) > 1:
+        raise CalibrationError(f"{option} {text}: auto is for all cameras alike")
     for camera, kind in chosen.items():
         if kind not in known:
             wrong_kind = f"{kind!r} for {camera}" if kind else f"there is none for {camera}"
@@ -258,10 +259,8 @@ def _lenses(
     options: CalibrateOptions, cameras: Collection[str], start: Rig | None
 ) -> dict[str, str]:
     """The lens model of each camera: as named, or the usual one of the start's lens."""
-    if options.lens is not None:
-        return _kinds(options.lens, cameras, "--lens", LENSES)
-    if start is None:
-        return dict.fromkeys(cameras, USUAL_LENS[OpenCVLens.model])
+    if start is None or options.lens not in (None, AUTO):
+        return _auto_or_kinds(options.lens or AUTO, cameras, "--lens", LENSES)
     return {name: USUAL_LENS[one.lens.model] for name, one in start.cameras.items()}
 
 
@@ -272,10 +271,7 @@ def _ports(
     if not options.water:
         return dict.fromkeys(cameras, NoPort.shape)
     if options.port is not None:
-        kinds = _kinds(options.port, cameras, "--port", (*PORTS, AUTO))
-        if AUTO in kinds.values() and len(set(kinds.values())) > 1:
-            raise CalibrationError(f"--port {options.port}: auto is for all cameras alike")
-        return kinds
+        return _auto_or_kinds(options.port, cameras, "--port", PORTS)
     old = {} if start is None else start.cameras
     known = {name: one.port.shape for name, one in old.items() if one.port.parameters}
     return dict.fromkeys(cameras, FlatPort.shape) | known

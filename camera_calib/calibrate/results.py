@@ -181,19 +181,19 @@ def _baseline_lines(rig: Rig, target: Target) -> Iterator[str]:
 
 
 def _trial_lines(calibration: Calibration) -> Iterator[str]:
-    """Housings that were compared, and which fit alike."""
+    """Housings and lenses that were compared, and which fit alike."""
     trials = calibration.housing_trials
     if not trials:
         return
-    shown = [f"{one.port} {one.noise_px:.4g} px" if not one.why else f"{one.port}: {one.why}"
-             for one in trials]  # fmt: skip
     chosen = min(trials, key=lambda one: one.criterion)
-    yield f"housing {chosen.port}: noise with {', '.join(shown)}"
+    names = {one: f"{one.port} with {one.lens}" for one in trials}
+    shown = [f"{names[one]}: {one.why or f'{one.noise_px:.4g} px'}" for one in trials]
+    yield f"likeliest is {names[chosen]}; noise: {', '.join(shown)}"
     minimum = min(one.noise_px for one in trials if not one.why)
     alike = [one.port for one in trials if one.noise_px < _ALIKE * minimum]
     if set(alike) == {NoPort.shape, DomePort.shape}:
         yield "a dome about the pupil and no port are the same camera: both fit alike"
-    elif len(alike) > 1:
+    elif len(set(alike)) > 1:
         yield f"{', '.join(alike)} fit alike: --start with a calibration in air tells them apart"
 
 

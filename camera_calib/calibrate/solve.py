@@ -45,7 +45,7 @@ from camera_calib.targets.target import Rejection
 Intrinsics = Literal["held", "prior", "free"]
 
 _MIN_VIEWS = 4
-_OUTLIER = 6.0
+OUTLIER = 6.0
 """Length of a residual, in sigmas of a coordinate, beyond which a point takes no part: of normal
 noise one in 65 million is longer."""
 _DULLEST = 3.0
@@ -112,8 +112,15 @@ def calibrate(
     used = fitting[alive_views]
     left_out = np.where(kept[..., None], np.nan, pixels)[alive_views]
     final = tuple(_views_of(usable, fitting, alive_views, start))
-    problem = CalibrationProblem(used, points, start, freedom, shape)
-    spread = spread_of(problem, adjusted)
+    spread = spread_of(CalibrationProblem(used, points, start, freedom, shape), adjusted)
+    if freedom.prior.parameters:  # the views weigh as much against it as their correlated noise
+        excess, prior = spread.excess, freedom.prior
+        firm = replace(freedom, prior=replace(prior, covariance=prior.covariance / excess))
+        adjusted = adjust(
+            final, points, adjusted.rig, adjusted.rig_from_target, firm, blur=adjusted.blur,
+            shape=adjusted.shape,
+        )  # fmt: skip
+        spread = spread_of(CalibrationProblem(used, points, start, firm, shape), adjusted, excess)
     rig = replace(
         adjusted.rig,
         source=f"{source} from {len(final)} views",
@@ -389,7 +396,7 @@ def _adjust_without_outliers(
         lengths[alive] = np.nan_to_num(np.linalg.norm(off, axis=-1), nan=np.inf)
         found = np.ones_like(blur)
         found[alive] = _blur(adjusted)
-        limits = np.maximum(_OUTLIER * adjusted.noise_px * found, _MIN_LIMIT_PX)
+        limits = np.maximum(OUTLIER * adjusted.noise_px * found, _MIN_LIMIT_PX)
         fitting = _fitting(measured, kept, measured & (lengths <= limits[..., None]))
         same = np.array_equal(fitting, kept) and np.allclose(found, blur, rtol=_SAME_BLUR)
         if same and adjusted.is_settled:
@@ -458,7 +465,7 @@ def _rejections(
     views: Sequence[TargetView], pixels: Array, kept: Flags, rig: Rig, adjusted: Adjustment
 ) -> list[Rejection]:
     """Pictures and points that the adjustment left out."""
-    limit = f"{_OUTLIER:.0f} sigmas (of {adjusted.noise_px:.2g} px, or of the picture's own noise)"
+    limit = f"{OUTLIER:.0f} sigmas (of {adjusted.noise_px:.2g} px, or of the picture's own noise)"
     rejections, names = [], list(rig.cameras)
     measured = np.isfinite(pixels[..., 0]).sum(axis=2)
     lost = measured - kept.sum(axis=2)

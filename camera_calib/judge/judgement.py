@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr
 
 from alice_survey.core.frames import Array
 from alice_survey.core.run import progress
@@ -16,7 +17,6 @@ from alice_survey.kit.document import Level, Verdict, worst_first
 from alice_survey.kit.words import count, with_sigma
 from camera_calib.calibration import Calibration
 from camera_calib.judge import residuals, uncertainty, validation
-from camera_calib.optics import likely_port
 from camera_calib.target_shape import BOW_X, BOW_Y
 
 DESIGN_RANGE_M = 2.0
@@ -28,26 +28,20 @@ _MAX_OUTLIERS = 0.01
 """Share of the points."""
 _HELD_OUT_LIMITS = 1.2, 2.0
 """Ratios above which a verdict is `look` and `bad`, here as in all pairs of limits."""
-_P_LOOK, _P_BAD = 1e-2, 1e-6
-"""Probabilities of the difference of two halves."""
-_FRESH_WATER = 1.33
-_RATIO_OFF = 0.12
-"""Share by which a ratio of focal lengths may differ from what the port makes of it; domes are
-centred by hand, and a flat port's distance lengthens them a little."""
+_P_LOOK, _P_BAD = 1e-3, 1e-6
+"""Levels of all tests: of an exact calibration, one verdict in a thousand is `look`."""
 _NEAREST_GLASS_M, _MAX_GLASS_M = 0.002, 0.25
-"""Distances from the pupil that a flat port of a housing may have."""
+"""Distance at which a port touches the lens, and the largest one of a housing."""
 _OPEN = 0.5
 """Share of its prior's sigma above which the views do not show a bow."""
 _VERY_BENT = 2.0
 """Bow over its prior's sigma."""
 _UNEVEN = 0.5
-"""Errors of the places of corners on the target, in the pictures, over the noise of a corner."""
+"""Systematic errors in the pictures over the noise of a corner: of the places of corners on the
+target, above which it should be better, and of the model, below which none is `bad`."""
 _SIGMAS = 3.0
-_MOVED_LIMITS = 3.5, 6.0
-"""Sigmas by which views may move a parameter from its prior."""
-_LEARNT = 0.99
-"""Share of a prior's variance below which the views determine a parameter as well."""
-_TREND_LIMITS = 0.35, 1.0
+_SHOWN = 1e-4
+"""Least variance of a parameter's change by the views, over its prior's; less is rounding."""
 _SIGMA_LIMITS = 3.0, 10.0
 """Projection sigma that nine tenths of the frame keep below, over the noise."""
 
@@ -182,6 +176,12 @@ def _grade(ratio: float, limits: tuple[float, float], text: str, advice: str = "
     return Verdict(level=level, text=text if level == "good" else text + advice)
 
 
+def _test(p_value: float, text: str, advice: str) -> Verdict:
+    """A verdict on what chance makes as large only with some probability."""
+    limits = -np.log(_P_LOOK), -np.log(_P_BAD)
+    return _grade(-np.log(max(p_value, 1e-300)), limits, f"{text} (p = {p_value:.2g})", advice)
+
+
 def _look(text: str) -> Verdict:
     return Verdict(level="look", text=text)
 
@@ -212,13 +212,20 @@ def _fit_verdicts(judged: Judgement) -> Iterator[Verdict]:
     yield from _outlier_verdicts(outliers, points, "points")
     for name, camera in judged.cameras.items():
         test = camera.homography
-        if test is not None and np.isfinite(test.outer_px):
+        if test is not None:
+            size = 1.0 if test.share <= _UNEVEN else 2.0  # a small misfit is not `bad`
             yield _grade(
-                test.excess_px / max(test.inner_px, 1e-12), _TREND_LIMITS,
-                f"{name}: homographies leave {test.inner_px:.3f} px within and "
-                f"{test.outer_px:.3f} px beyond {test.outer_from_px:.0f} px from the centre",
-                "; the model of lens or port does not fit",
+                size if test.p_value < _P_LOOK else 0.0, (0.0, 1.0),
+                f"{name}: homographies leave {test.noise_px:.3f} px, of which {test.share:.2f} is "
+                f"the same at one place of the frame in all views (p = {test.p_value:.2g})",
+                f"; the model of lens or port does not fit{_port_advice(judged.calibration)}",
             )  # fmt: skip
+
+
+def _port_advice(calibration: Calibration) -> str:
+    """The comparison of ports, for views under water that were not compared yet."""
+    compared = len({trial.port for trial in calibration.housing_trials}) > 1
+    return "" if compared or not calibration.freedom.prior.parameters else ": try --port auto"
 
 
 def _port_verdicts(judged: Judgement) -> Iterator[Verdict]:
@@ -232,20 +239,14 @@ def _port_verdicts(judged: Judgement) -> Iterator[Verdict]:
                 f"the right camera is {-x:.0f} mm to the left of the left one: swap --left and "
                 "--right, unless the cameras hang upside down"
             )
-    for name, camera in rig.cameras.items():
-        ratio = calibration.focal_ratios.get(name)
-        if ratio is not None:
-            yield _grade(
-                abs(ratio / camera.port.magnification - 1.0), (_RATIO_OFF, _RATIO_OFF),
-                f"focal lengths of {name} under water are {ratio:.3f} times those in air: "
-                f"{max(camera.n_water, _FRESH_WATER):.3g} behind a flat port, near 1 behind a dome "
-                "or without a port",
-                f"; calibrate with --port {likely_port(ratio)}, or --port auto",
-            )  # fmt: skip
+    # Where housings were compared, what each leaves has decided already.
+    compared = len({trial.port for trial in calibration.housing_trials}) > 1
+    for name, camera in rig.cameras.items() if not compared else ():
         spread_m = _SIGMAS * rig.sigmas.get(f"{name}.port_distance_m", np.inf)
         if np.isfinite(spread_m):
             distance_m = camera.parameter("port_distance_m")
-            if not _NEAREST_GLASS_M - spread_m < distance_m <= _MAX_GLASS_M + spread_m:
+            at_pupil = distance_m <= camera.port.minimum("port_distance_m")
+            if (at_pupil and spread_m < _NEAREST_GLASS_M) or distance_m > _MAX_GLASS_M + spread_m:
                 yield _bad(
                     f"the flat port of {name} ended {distance_m * 1e3:.2g} mm before the pupil, "
                     "where no housing has glass: the pictures are through a dome, without a port, "
@@ -257,25 +258,28 @@ def _port_verdicts(judged: Judgement) -> Iterator[Verdict]:
 def _prior_verdicts(calibration: Calibration) -> Iterator[Verdict]:
     """Whether the views contradict what was known before, as a wrong kind of port makes them do.
 
-    The change of a parameter by the views has the variance of its prior less that of the result.
-    Where correlated noise of the corners makes the result the less certain of the two, it has their
-    sum at most.
+    Of the prior's error d the result has a part K d. Its change by the views, whose own errors are
+    independent of d, thus has the variance of both less twice that of K d with d.
     """
     prior, result = calibration.freedom.prior, calibration.rig.covariance
     if result is None or not prior.parameters:
         return
+    count = len(prior.parameters)
+    first = calibration.shared.shape[1] - count - len(calibration.shape.parameters)
+    at = [result.parameters.index(name) for name in prior.parameters]
+    kept = calibration.shared[at, first : first + count]
+    of_prior = kept @ np.linalg.inv(np.linalg.cholesky(prior.information))
     before = np.diag(prior.covariance)
-    after = np.diag(result.marginal(prior.parameters).matrix)
-    spread = np.sqrt(np.where(after < _LEARNT * before, before - after, before + after))
-    moved = np.abs(prior.misfit(calibration.rig) / spread)
+    change = before + np.diag(result.matrix)[at] - 2.0 * np.diag(of_prior)
+    moved = np.abs(prior.misfit(calibration.rig)) / np.sqrt(np.maximum(change, _SHOWN * before))
     largest = int(moved.argmax())
-    yield _grade(
-        float(moved[largest]), _MOVED_LIMITS,
+    yield _test(
+        min(2.0 * count * float(ndtr(-moved[largest])), 1.0),
         f"the views move {prior.parameters[largest]} by {moved[largest]:.1f} sigmas from its prior,"
         " more than any other parameter",
-        ": port, lens or water differ from the prior; try --port auto, or --intrinsics free if the "
-        "focus changed",
-    )  # fmt: skip
+        f"; port, lens or water differ from the prior{_port_advice(calibration)}, or --intrinsics "
+        "free if the focus changed",
+    )
 
 
 def _hold_out_verdicts(judged: Judgement) -> Iterator[Verdict]:
@@ -293,12 +297,12 @@ def _hold_out_verdicts(judged: Judgement) -> Iterator[Verdict]:
     )  # fmt: skip
     yield from _outlier_verdicts(score.outliers, score.points + score.outliers, "held-out points")
     if halves is not None:
-        yield _grade(
-            -np.log(max(halves.p_value, 1e-300)), (-np.log(_P_LOOK), -np.log(_P_BAD)),
+        yield _test(
+            halves.p_value,
             f"parameters from either half of the views differ by chi2 {halves.chi2:.1f} for "
-            f"{halves.parameters} (p = {halves.p_value:.2g})",
+            f"{halves.parameters}",
             ": the sigmas are too small; did lens, port or target change between views?",
-        )  # fmt: skip
+        )
 
 
 def _target_verdicts(judged: Judgement) -> Iterator[Verdict]:

@@ -10,13 +10,16 @@
   moves is taken off first.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.polynomial import legendre
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform
+from scipy.special import stdtr
 
 from alice_survey.core.frames import Array
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
@@ -37,8 +40,8 @@ _FLAT_SHARE = 1e-6
 _OUTLYING = 6.0
 """Outlier limit of length over median length: 7 sigmas of normal noise."""
 _HALF_STEP_PX = 0.5
-_OUTER_SHARE = 0.7
-"""Residuals beyond this share of the largest radius with points are compared with the others."""
+_RINGS = 6
+"""Radial fields: as many as can be told from the usual lenses' four terms, and from one another."""
 
 
 def within_gate(residuals_px: Array, noise_px: Array | float) -> NDArray[np.bool_]:
@@ -197,33 +200,20 @@ def points_by_cell(camera: Camera, pixels: Array) -> NDArray[np.intp]:
 class HomographyTest:
     """Homography residuals of one camera, over all views."""
 
-    views: int
-    inner_px: float
-    """Standard deviation of one coordinate of the inner points, by the degrees of freedom."""
-    outer_px: float
-    """The same of the outer points."""
-    outer_from_px: float
-    """Radius at which outer points begin."""
-    inner_count: int
-    outer_count: int
-
-    @property
-    def excess_px(self) -> float:
-        """Excess of the outer residuals over the inner ones and chance (3 sigma); 0 if none.
-
-        The variance of n points, two coordinates each, has a relative sigma of 1 / sqrt(n).
-        """
-        if not self.outer_count:
-            return 0.0
-        chance = self.inner_px**2 * (1.0 + 3.0 / self.outer_count**0.5)
-        return float(max(self.outer_px**2 - chance, 0.0) ** 0.5)
+    points: int
+    noise_px: float
+    """Standard deviation of one coordinate, by the degrees of freedom, median of the views."""
+    p_value: float
+    """Probability that noise alone leaves as much at the same places of the frame."""
+    share: float
+    """Rms of that over the noise."""
 
 
 def homography_test(calibration: Calibration, camera: str) -> HomographyTest | None:
     """Fit a homography to every view of one camera.
 
     Returns:
-        None where the target is not flat, or no view has enough points.
+        None where the target is not flat, or fewer than two views have enough points.
     """
     points = calibration.drawn_points
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
@@ -231,7 +221,7 @@ def homography_test(calibration: Calibration, camera: str) -> HomographyTest | N
     model = calibration.rig.cameras[camera]
     known = np.isfinite(calibration.residuals_px[:, index, :, 0])
     usable = np.nonzero(known.sum(axis=1) >= _MIN_POINTS)[0]
-    if spread[2] >= _FLAT_SHARE * spread[0] or not len(usable):
+    if spread[2] >= _FLAT_SHARE * spread[0] or len(usable) < 2:
         return None
     measured = stack_views(calibration.views, calibration.rig, len(points))[:, index]
     poses = [calibration.rig.cam_from_rig[camera] * pose for pose in calibration.rig_from_target]
@@ -242,40 +232,65 @@ def homography_test(calibration: Calibration, camera: str) -> HomographyTest | N
     depths = np.concatenate([poses[v].apply(points[known[v]])[:, 2] for v in usable])
     warp = best_warp(model, float(depths.min()), float(depths.max()))
     fits = [_fit_view(warp, points[known[v]], measured[v, known[v]], poses[v]) for v in usable]
-    pixels, residuals, freedom = (np.concatenate(parts) for parts in zip(*fits, strict=True))
-    radius = np.linalg.norm(pixels - [model.cx_px, model.cy_px], axis=1)
-    outer_from = _OUTER_SHARE * float(radius.max())
-    inner = radius < outer_from
+    return _field_test(np.array([model.cx_px, model.cy_px]), fits)
+
+
+def _field_test(centre: Array, views: Sequence[tuple[Array, ...]]) -> HomographyTest:
+    """How likely noise leaves as much along one of some fields in view after view, and its share.
+
+    A wrong model pushes points of one place in the frame, and of one distance there, the same way
+    in all views; noise does not, however it goes together within a picture or grows outwards.
+    Student's test of each field's part in the views' residuals, at a level shared by the fields.
+
+    Args:
+        centre: principal point.
+        views: as `_fit_view` returns them.
+    """
+    away = [pixels - centre for pixels, *_ in views]
+    largest = max(float(np.linalg.norm(one, axis=1).max()) for one in away)
+    nearness = [1.0 / depth for *_, depth in views]
+    middle, spread = np.mean(np.concatenate(nearness)), np.std(np.concatenate(nearness))
+    parts, squares = np.zeros((2, len(views), _RINGS + 3))
+    squares_px = [(one**2).sum() / (one.size - len(taken.T)) for _, one, taken, _ in views]
+    noise_px = float(np.sqrt(np.median(squares_px))) + 1e-300
+    for v, (_, residuals, taken, _) in enumerate(views):
+        place = away[v] / largest
+        rings = legendre.legvander(2.0 * (place**2).sum(axis=1) - 1.0, _RINGS - 1)[:, 1:]
+        near = (nearness[v] - middle)[:, None] / max(spread, 1e-12)
+        sizes = np.concatenate([rings, place * rings[:, :1], near * rings[:, :2]], axis=1)
+        fields = (place[:, :, None] * sizes[:, None]).reshape(taken.shape[0], -1)
+        fields -= taken @ (taken.T @ fields)
+        parts[v] = residuals.ravel() @ fields / noise_px
+        squares[v] = (fields**2).sum(axis=0)
+    total, points = squares.sum(axis=0), sum(len(one) for one in away)
+    size = parts.sum(axis=0) / total  # of each field, over the noise
+    off = (parts - size * squares) / np.sqrt(squares)
+    students = size * np.sqrt(total * (len(views) - 1) / (off**2).sum(axis=0))
+    tails = 2.0 * stdtr(len(views) - 1, -np.abs(students))
+    worst = int(np.argmin(tails))
     return HomographyTest(
-        views=len(usable),
-        inner_px=_sigma(residuals[inner], freedom[inner]),
-        outer_px=_sigma(residuals[~inner], freedom[~inner]),
-        outer_from_px=outer_from,
-        inner_count=int(inner.sum()),
-        outer_count=int((~inner).sum()),
+        points=points,
+        noise_px=noise_px,
+        p_value=min(float(tails[worst]) * len(tails), 1.0),
+        share=float(abs(size[worst]) * np.sqrt(total[worst] / points)),
     )
 
 
 def _fit_view(
     warp: PinholeWarp, target_points: Array, pixels: Array, cam_from_target: RigidTransform
-) -> tuple[Array, Array, Array]:
-    """Pixels and their `homography_residuals`, once outliers are set aside.
+) -> tuple[Array, Array, Array, Array]:
+    """Pixels, their `homography_residuals` and depths, once outliers are set aside.
 
     Outliers are found by the homography, not by the calibration's residuals: what its model cannot
     fit must not hide here.
     """
     while True:
-        residuals, freedom = homography_residuals(warp, target_points, pixels, cam_from_target)
+        residuals, taken = homography_residuals(warp, target_points, pixels, cam_from_target)
         length = np.linalg.norm(residuals, axis=1)
         stay = length <= _OUTLYING * float(np.median(length))
         if stay.all() or stay.sum() < _MIN_POINTS:
-            return pixels, residuals, freedom
+            return pixels, residuals, taken, cam_from_target.apply(target_points)[:, 2]
         target_points, pixels = target_points[stay], pixels[stay]
-
-
-def _sigma(residuals: Array, freedom: Array) -> float:
-    total = float(freedom.sum())
-    return float(((residuals**2).mean(axis=1).sum() / total) ** 0.5) if total > 0 else float("nan")
 
 
 def homography_residuals(
@@ -290,8 +305,8 @@ def homography_residuals(
         cam_from_target: gives the distances of the points.
 
     Returns:
-        Residuals (N, 2), fitted minus measured, in the camera's pixels; and (N,) the share of the
-        noise's variance that the fit leaves in each (1 minus its leverage).
+        Residuals (N, 2), fitted minus measured, in the camera's pixels; and (2 N, 8) orthonormal
+        directions of these that the fit takes up.
     """
     depth = cam_from_target.apply(target_points)[:, 2]
     seen = warp.to_pinhole(pixels, depth)
@@ -317,8 +332,7 @@ def homography_residuals(
 
     start = np.ravel(cv2.findHomography(plane, (seen - centre) / size)[0])[:8]
     found = least_squares(misfit, start, slopes, method="lm", xtol=1e-14, ftol=1e-15, gtol=1e-15)
-    leverage = (np.linalg.qr(slopes(found.x))[0] ** 2).sum(axis=1).reshape(-1, 2).mean(axis=1)
-    return found.fun.reshape(-1, 2), 1.0 - leverage
+    return found.fun.reshape(-1, 2), np.linalg.qr(slopes(found.x))[0]
 
 
 def _plane_coordinates(points: Array) -> Array:

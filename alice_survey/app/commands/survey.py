@@ -238,8 +238,8 @@ class CalibrateCommand(SurveyCommand, ThreadsCommand):
     )
     output: Path | None = OUTPUT
     lens: str | None = option(
-        None, "pinhole, k1, k2, opencv4, opencv5, rational, prism, full or fisheye, and other ones "
-        "of some cameras: opencv5,side=fisheye.",
+        None, "pinhole, k1, k2, opencv4, opencv5, rational, prism, full or fisheye, other ones of "
+        "some cameras: opencv5,side=fisheye; auto, the default: opencv5 or fisheye.",
     )  # fmt: skip
     water: bool = option(False, "Under water through ports, or in air.", "--water/--air")
     start: Path | None = option(None, "rig.json calibrated in air.")

@@ -2,8 +2,12 @@
 
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
+import numpy as np
 import pytest
+from scipy.spatial.distance import cdist
+from scipy.spatial.transform import Rotation
 
 from alice_survey.core.errors import CalibrationError
 from camera_calib.calibrate.detect_views import Detections
@@ -11,14 +15,20 @@ from camera_calib.calibrate.from_pictures import calibrate_task
 from camera_calib.calibrate.options import CalibrateOptions, task_of
 from camera_calib.calibrate.results import calibration_text
 from camera_calib.calibrate.solve import calibrate_in_air
-from camera_calib.calibration import Calibration
+from camera_calib.calibration import Calibration, TargetView
+from camera_calib.camera import Camera
+from camera_calib.freedom import USUAL_LENS
 from camera_calib.judge.judgement import judge, verdicts
+from camera_calib.lenses.fisheye import FisheyeLens
+from camera_calib.lenses.opencv import OpenCVLens
+from camera_calib.lenses.values import LensValues
 from camera_calib.ports.dome import DomePort
 from camera_calib.ports.flat import FlatPort
 from camera_calib.ports.values import PortValues
 from camera_calib.rig import Rig
 from camera_calib.targets.target import parse_target
 from tests.camera_calib.calibration_scenes import BOARD, built_rig, in_air, scene
+from tests.oracles_dome import ray_to
 
 TRUTH = built_rig()
 TARGET = parse_target("chessboard 11x8 30mm")
@@ -45,14 +55,10 @@ def calibrated(options: CalibrateOptions, found: Detections) -> Calibration:
     return calibrate_task(task_of(options, places, TARGET, dry()), found)
 
 
-@pytest.mark.parametrize(
-    ("port", "kind", "ratio"), [(FLAT, "flat", 1.34), (CENTRED, "none", 1.0), (OFF, "dome", 0.98)]
-)
-def test_the_housing_is_found(port: PortValues, kind: str, ratio: float) -> None:
+@pytest.mark.parametrize(("port", "kind"), [(FLAT, "flat"), (CENTRED, "none"), (OFF, "dome")])
+def test_the_housing_is_found(port: PortValues, kind: str) -> None:
     found = calibrated(CalibrateOptions(water=True, port="auto", glass_mm="6"), through(port))
     assert {camera.port.shape for camera in found.rig.cameras.values()} == {kind}
-    for value in found.focal_ratios.values():
-        assert value == pytest.approx(ratio, abs=0.01)
     assert 0.8 * NOISE_PX < found.noise_px < 1.2 * NOISE_PX
     said = verdicts(judge(found, None))
     if kind == "dome":
@@ -64,7 +70,7 @@ def test_the_housing_is_found(port: PortValues, kind: str, ratio: float) -> None
     assert ("same camera" in text) == (kind == "none")
     fixed = [line for line in text.splitlines() if line.split()[1:3] == ["6", "(fixed)"]]
     assert len(fixed) == (0 if kind == "none" else len(TRUTH.cameras))
-    assert not [v for v in said if v.level == "bad" and "focal lengths" in v.text]
+    assert not [v for v in said if "--port auto" in v.text]
 
 
 BARE = CalibrateOptions(water=True, port="none")
@@ -74,8 +80,8 @@ BARE = CalibrateOptions(water=True, port="none")
 @pytest.mark.parametrize(
     ("options", "port", "named"),
     [
-        (CalibrateOptions(water=True, glass_mm="6"), CENTRED, "--port dome"),
-        (BARE, FLAT, "--port flat"),
+        (CalibrateOptions(water=True, glass_mm="6"), CENTRED, "another port"),
+        (BARE, FLAT, "--port auto"),
         (BARE, OFF, "from its prior"),
     ],
 )
@@ -88,3 +94,83 @@ def test_another_housing_is_bad(options: CalibrateOptions, port: PortValues, nam
     else:
         said = [v for v in verdicts(judge(found, None)) if named in v.text]
         assert {v.level for v in said} == {"bad"}
+
+
+AIR = Camera(
+    width_px=1440, height_px=1080,
+    lens=OpenCVLens(fx_px=2425.0, fy_px=2424.0, cx_px=735.0, cy_px=560.0, k1=-0.35, k2=0.3),
+)  # fmt: skip
+SMALL = parse_target("chessboard 8x6 30mm")
+ACRYLIC = DomePort(
+    dome_x_m=0.0017, dome_y_m=-0.0025, dome_z_m=-0.007, outer_radius_m=0.047302,
+    glass_thickness_m=0.00375, n_glass=1.495, n_water=1.333,
+)  # fmt: skip
+
+
+def seen_by_tracing(
+    port: DomePort | None, count: int, seed: int, lens: LensValues = AIR.lens
+) -> Detections:
+    """Corners of a board stretched by 0.35 %, smooth errors of 0.1 px in each picture included."""
+    rng, views = np.random.default_rng([46, seed]), []
+    wide = AIR.fx_px / lens.fx_px
+    points = SMALL.points * [1.00175, 0.99825, 1.0]
+    kernel = np.exp(-cdist(points, points, "sqeuclidean") / (2.0 * 0.08**2))
+    smooth = np.linalg.cholesky(kernel + 1e-9 * np.eye(len(points)))
+    while len(views) < count:
+        turn = Rotation.from_euler("xyz", rng.uniform(-35.0, 35.0, 3), degrees=True)
+        place = rng.uniform([-0.2 * wide, -0.15 * wide, 0.5], [0.2 * wide, 0.15 * wide, 1.1])
+        cam = turn.apply(points - points.mean(axis=0)) + place
+        rays = cam if port is None else np.array([ray_to(port, point) for point in cam])
+        pixels = replace(AIR, lens=lens).project(rays)
+        if np.all(cam[:, 2] > 0.1) and np.all((pixels > 3.0) & (pixels < [1437.0, 1077.0])):
+            errors = rng.normal(0.0, 0.05, pixels.shape)
+            errors += 0.1 * smooth @ rng.normal(size=pixels.shape)
+            views.append(TargetView(name=f"{len(views):02d}", pixels={"camera": pixels + errors}))
+    return Detections(views=tuple(views), sizes={"camera": (1440, 1080)}, rejections=())
+
+
+def alone(found: Detections, start: Rig | None = None, **given: Any) -> Calibration:
+    options = CalibrateOptions(water=start is not None, **given)
+    return calibrate_task(task_of(options, {"camera": "x"}, SMALL, start), found)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_dome_off_its_centre_is_found_by_all_views_and_by_halves(seed: int) -> None:
+    air = alone(seen_by_tracing(None, 24, seed), lens="opencv5").rig
+    whole = seen_by_tracing(ACRYLIC, 24, seed + 10)
+    for views in (whole.views, whole.views[::2], whole.views[1::2]):
+        found = alone(
+            replace(whole, views=views), air, port="auto", dome_radius_mm="47.302",
+            glass_mm="3.75", n_glass="1.495", n_water="1.333",
+        )  # fmt: skip
+        port = found.rig.cameras["camera"].port
+        assert port.shape == "dome"
+        for axis in ("dome_x_m", "dome_y_m", "dome_z_m"):
+            sigma = found.rig.sigmas[f"camera.{axis}"]
+            assert 5e-5 < sigma < 1.5e-3
+            assert abs(getattr(port, axis) - getattr(ACRYLIC, axis)) < 4.0 * sigma
+        said = verdicts(judge(found, None))
+        assert not [v for v in said if v.level == "bad" and "(p = " in v.text]
+        assert not [v for v in said if "--port auto" in v.text]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("port_m", "kind"), [(0.0008, "flat"), (0.06, "flat")])
+def test_a_flat_port_that_is_compared_is_not_impossible(port_m: float, kind: str) -> None:
+    port = FlatPort(port_distance_m=port_m, glass_thickness_m=0.006, n_glass=1.49)
+    found = calibrated(CalibrateOptions(water=True, port="auto", glass_mm="6"), through(port))
+    assert {camera.port.shape for camera in found.rig.cameras.values()} == {kind}
+    assert not [v for v in verdicts(judge(found, None)) if v.level == "bad"]
+
+
+def test_the_lens_is_found_by_what_it_leaves() -> None:
+    fisheye = FisheyeLens(fx_px=560.0, fy_px=560.0, cx_px=719.0, cy_px=541.0, k1=0.02, k2=-0.01)
+    for lens, model in ((fisheye, "fisheye"), (AIR.lens, "opencv")):
+        found = alone(seen_by_tracing(None, 14, 3, lens))
+        camera = found.rig.cameras["camera"]
+        assert camera.lens.model == model
+        assert abs(camera.fx_px - lens.fx_px) < 5.0 * found.rig.sigmas["camera.fx_px"]
+        best = min(found.housing_trials, key=lambda trial: trial.criterion)
+        assert best.lens == USUAL_LENS[model]
+        assert {one.lens for one in found.housing_trials} == set(USUAL_LENS.values())
