@@ -14,7 +14,8 @@ its keypoints, a smooth field over the frame with a prior, and the rig moves by 
 A right calibration with covariance P lets pictures move its parameters by d, and leaves the
 covariance Q: d is then normal with covariance P - Q. In the directions that pictures measure, the
 eigenvectors u of P^-1/2 (P - Q) P^-T/2 with eigenvalues above zero, (u . P^-1/2 d)^2 / eigenvalue
-adds up to chi-square.
+adds up to chi-square. Where that contradicts the calibration, its sigmas are too small by the root
+of chi-square over the number of directions, and so are all that follow from them.
 """
 
 import math
@@ -183,6 +184,9 @@ class SurveyFit:
     sigma_px: float
     """Sigma of one coordinate of a keypoint."""
     observations: int
+    contradiction: Contradiction | None
+    """What the pictures say against the calibration, by which `covariance` is wider; None where
+    they agree with it."""
 
     @property
     def after(self) -> Array:
@@ -193,12 +197,6 @@ class SurveyFit:
     def prior_sigmas(self) -> Array:
         """(G,) sigmas of the values before."""
         return np.sqrt(np.diag(self.prior_covariance))
-
-    @property
-    def contradiction(self) -> Contradiction | None:
-        """What the pictures say against the calibration; None where they agree with it."""
-        change = self.after - self.before
-        return contradiction(self.parameters, change, self.prior_covariance, self.covariance)
 
     @cached_property
     def rig(self) -> Rig:
@@ -305,17 +303,22 @@ def fit_survey(
         equations = problem.reduce(guess, found.noise, fields)
     sigma_px, variance = found.noise.tolist()
     weights = cauchy_weights(guess.miss, sigma_px)
+    prior_covariance = inverse_of(problem.information)[own, own]
+    change = np.array([value(guess.state.rig, name) for name in problem.fields]) - before
+    against = contradiction(problem.fields, change, prior_covariance, covariance)
+    wider = 1.0 if against is None else max(1.0, against.chi_square / against.directions)
     return SurveyFit(
         calibrated=rig,
         state=replace(guess.state, points=guess.state.points[np.argsort(order)]),
         point_ids=ids,
         parameters=problem.fields,
         before=before,
-        prior_covariance=inverse_of(problem.information)[own, own],
-        covariance=covariance,
-        calibration=motions_of(equations, guess.state.points, known) if fields else None,
+        prior_covariance=prior_covariance,
+        covariance=wider * covariance,
+        calibration=motions_of(equations, guess.state.points, wider * known) if fields else None,
         sigma_px=float(np.sqrt(variance / weights.mean())),
         observations=len(pixels.station),
+        contradiction=against,
     )
 
 

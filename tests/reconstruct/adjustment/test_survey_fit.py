@@ -428,7 +428,10 @@ def test_a_port_stated_too_well_is_named_and_a_right_one_is_not(
     stated = {f"{name}.{field}": s for name in scene.rig.cameras for field, s in STATED.items()}
     rig = with_sigmas(with_camera(scene.rig, "left", **off), stated)
     mapped, seen = modelled(scene, rig, tmp_path)
-    found = fit_survey(mapped, seen, rig, port=True, pose=False).contradiction
+    fit = fit_survey(mapped, seen, rig, port=True, pose=False)
+    found = fit.contradiction
+    off = np.sqrt(np.mean(np.square(errors_in_sigmas(fit, scene.rig))))
+    assert off < (20.0 if about == "" else 2.0), "of 160 and of 20 stated sigmas"
     assert (found is None) == (about is None)
     if found is not None and about is not None:
         assert about in found.words
