@@ -193,11 +193,6 @@ class SurveyFit:
         """(G,) adjusted values."""
         return np.array([value(self.state.rig, name) for name in self.parameters])
 
-    @property
-    def prior_sigmas(self) -> Array:
-        """(G,) sigmas of the values before."""
-        return np.sqrt(np.diag(self.prior_covariance))
-
     @cached_property
     def rig(self) -> Rig:
         """The rig with the covariance of all that was adjusted; as calibrated if nothing was."""
@@ -249,7 +244,7 @@ class SurveyFit:
             parameters=self.parameters,
             before=tuple(self.before.tolist()),
             after=tuple(self.after.tolist()),
-            prior_sigmas=tuple(self.prior_sigmas.tolist()),
+            prior_sigmas=tuple(np.sqrt(np.diag(self.prior_covariance)).tolist()),
             sigmas=tuple(known.sigmas.values()),
             correlation=tuple(map(tuple, known.correlation.tolist())),
             contradiction=None if found is None else found.words,

@@ -323,23 +323,17 @@ def scatter_of_times(epochs: Epochs, place: Similarity, known_s: float) -> tuple
     Navigation's errors change slowly, and alike in all directions; those of a time act along the
     way only. Of three readings, the middle one minus what the others say of its time shows both.
     """
-    first, time = np.unique(epochs.moment, return_index=True)[1], epochs.time
-    if not epochs.timed or len(time) < 3:
-        return 0.0, 0.0
-    at = epochs.positions(place)[first]
-    off = (at - epochs.measured_ned[first])[:, :2]
-    step, known = np.diff(time), epochs.known[:, 0]
-    near = (step > 0) & (step < _NEAR_STEPS * np.median(step))
-    used = near[1:] & near[:-1] & known[2:] & known[1:-1] & known[:-2]
-    span = np.where(used, time[2:] - time[:-2], 1.0)[:, None]
-    velocity = (at[2:] - at[:-2])[:, :2] / span
-    bend = off[1:-1] - (step[1:, None] * off[:-2] + step[:-1, None] * off[2:]) / span
-    square = (velocity**2).sum(axis=1)
-    used &= square > 0
+    first = np.unique(epochs.moment, return_index=True)[1]
+    at, known = epochs.positions(place), epochs.known[:, 0]
+    off, way = (at - epochs.measured_ned)[first, :2], _velocities(epochs, at)[first, :2][1:-1]
+    square = (way**2).sum(axis=1)
+    used = known[2:] & known[1:-1] & known[:-2] & (square > 0)
     if not used.any():
         return 0.0, 0.0
     spread = _LOG_SPREAD / float(np.sqrt(used.sum()))
-    seconds = np.stack([bend * velocity, bend[:, ::-1] * velocity * [1.0, -1.0]]).sum(axis=2)
+    step = np.maximum(np.diff(epochs.time), 1e-9)[:, None]
+    bend = off[1:-1] - (step[1:] * off[:-2] + step[:-1] * off[2:]) / (step[1:] + step[:-1])
+    seconds = np.stack([bend * way, bend[:, ::-1] * way * [1.0, -1.0]]).sum(axis=2)
     along, across = MAD_TO_SIGMA * np.median(np.abs(seconds[:, used]) / square[used], axis=1)
     clear = along > across * np.exp(_FEW_SIGMAS * spread)
     found = float(np.sqrt(max(along**2 - across**2, 0.0) / 1.5))
@@ -417,7 +411,9 @@ def first_placement(
     Returns:
         The placement; None, after a warning, where navigation gives no scale or place.
     """
-    scale, turn, has = known_scale, 0.0, _has_angles(epochs)
+    scale, turn = known_scale, 0.0
+    angles = np.where(epochs.known, 0.0, np.nan)[epochs.moment, 3:].sum(axis=1)
+    has = np.isfinite(angles)
     if epochs.has_horizontal:
         at = epochs.known[epochs.moment, 0]
         count = int(epochs.known[:, 0].sum())
@@ -451,11 +447,6 @@ def first_placement(
         some = np.flatnonzero(has)
         rotation = (epochs.ned_from_body[some] * epochs.model_from_body[some].inv()).mean()
     return _shift(epochs, levelled, scale, rotation)
-
-
-def _has_angles(epochs: Epochs) -> NDArray[np.bool_]:
-    """(N,) whether roll, pitch and heading of a picture are known."""
-    return np.asarray(np.isfinite(np.where(epochs.known, 0.0, np.nan)[epochs.moment, 3:].sum(1)))
 
 
 def _scale_by_relief(epochs: Epochs, levelled: Similarity) -> float | None:

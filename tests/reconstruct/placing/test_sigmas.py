@@ -331,7 +331,7 @@ def test_sigmas_that_are_stated_too_small_are_enlarged() -> None:
     for group in ("horizontal", "depth", "heading"):
         assert 3.5 < fit.correlation[group].factor < 8.0
     honest, _, _ = place(body, flown(body, 4, 1.0), 1)
-    assert all(how.factor < 1.3 for how in honest.correlation.values())
+    assert all(how.factor < 1.6 for how in honest.correlation.values())
 
 
 def test_a_single_line_without_attitude_does_not_know_its_roll() -> None:
