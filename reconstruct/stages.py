@@ -101,7 +101,7 @@ def _placing_summary(folder: Path) -> Summary:
             for joint in found.joints
         )
     if place is not None and place.mount is not None:
-        text += f"; {found.georeference.mount.words}"
+        text += f"; {place.mount.words}"
     return text, found.to_json()
 
 

@@ -138,7 +138,7 @@ def frame_terms(camera: Camera, pixels: Array) -> Array:
     size, orders = np.array([camera.width_px, camera.height_px]), np.arange(_ORDER + 1)
     u, v = legvander((2.0 * pixels / size - 1.0).T, _ORDER) * np.sqrt(2 * orders + 1)
     row, column = np.nonzero(np.add.outer(orders, orders) <= _ORDER)
-    return u[:, row] * v[:, column]
+    return np.asarray(u[:, row] * v[:, column])
 
 
 def calibrated_parameters(rig: Rig, names: Sequence[str]) -> tuple[str, ...]:

@@ -221,12 +221,12 @@ def test_times_that_scatter_are_named_and_leave_the_heading_its_sigma(
 ) -> None:
     """Readings of other times than the pictures', with one constant error of the compass."""
     body, ratios = flight(6, 14), []
-    time = STEP_S * np.arange(len(body))
+    time: Array = STEP_S * np.arange(len(body), dtype=np.float64)
     for seed in range(5):
         rng = np.random.default_rng([seed, 46])
         errors = SIGMA * gauss_markov(rng, len(body), 400.0)
         errors[:, 5] = SIGMA[5] * rng.normal()
-        at = np.clip(time + rng.uniform(-scatter_s, scatter_s, len(time)), 0.0, time[-1])
+        at: Array = np.clip(time + rng.uniform(-scatter_s, scatter_s, len(time)), 0.0, time[-1])
         read = interpolate_poses(time, body, at)
         fit, error, sigma = place(body, records_of(read, errors, SIGMA), seed)
         ratios.append(error[5] / sigma[5])
