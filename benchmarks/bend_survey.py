@@ -21,12 +21,7 @@ from alice_survey.app.api.survey import Survey
 from alice_survey.app.pipeline import run
 from alice_survey.core.config import SurveyConfig
 from alice_survey.core.executor import local_executor
-from alice_survey.core.frames import (
-    Array,
-    Datum,
-    attitude_from_rotation,
-    interpolate_poses,
-)
+from alice_survey.core.frames import Array, Datum, attitude_from_rotation, interpolate_poses
 from alice_survey.core.manifest import ImageRecord
 from alice_survey.core.records import RangeRecord
 from alice_survey.core.trajectory import Trajectory, read_columns, read_track
@@ -35,7 +30,6 @@ from camera_calib.freedom import move_rig
 from camera_calib.rig import Covariance, Rig, read_rig
 from missions.logs.navigation_csv import NavigationLog, read_navigation
 from missions.values.plan_file import read_plan
-from reconstruct.adjustment.survey_fit import bias_covariance
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped
 from tests.reconstruct.scenes import Scene
@@ -187,8 +181,10 @@ def wrong_rig(rig: Rig, times: float, seed: int, *, bias_px: float = 0.0) -> Rig
     names, scale = rig.covariance.parameters, np.sqrt(np.diag(rig.covariance.matrix))
     factor = np.linalg.cholesky(rig.covariance.correlation)
     step = times * scale * (factor @ rng.normal(size=len(scale)))
-    parts, axes = np.linalg.eigh(bias_covariance(rig, names, bias_px) / np.outer(scale, scale))
-    step += scale * (axes @ (np.sqrt(np.maximum(parts, 0.0)) * rng.normal(size=len(scale))))
+    for name, camera in rig.cameras.items():
+        radius_px = np.hypot(camera.width_px, camera.height_px) / np.sqrt(12.0)
+        own = [names.index(f"{name}.{field}") for field in ("fx_px", "fy_px")]
+        step[own] += bias_px * rng.normal() / radius_px * camera.parameter("fx_px")
     return move_rig(rig, names, step)
 
 

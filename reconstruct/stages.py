@@ -87,13 +87,21 @@ def _placing_summary(folder: Path) -> Summary:
         f"{found.registered} of {count(found.total, 'picture')} registered, "
         f"{found.mean_reprojection_px:.2f} px; {found.scale_source}"
     )
+    place = found.georeference
+    if (
+        place is not None
+        and place.scale_of_navigation_sigma
+        and "rig" in (found.scale_source or "")
+    ):
+        share, sigma = place.scale_of_navigation or math.nan, place.scale_of_navigation_sigma
+        text += f", that of navigation {share:.4f} of it, sigma {sigma:.2g}"
     if found.joints:
         text += f"; {len(found.joints) + 1} parts that navigation alone joins, to " + " and ".join(
             f"{math.hypot(joint.sigma_north_m, joint.sigma_east_m, joint.sigma_depth_m):.2g} m"
             for joint in found.joints
         )
-    if found.georeference is not None and found.georeference.mount is not None:
-        text += f"; {found.georeference.mount.words}"
+    if place is not None and place.mount is not None:
+        text += f"; {place.mount.words}"
     return text, found.to_json()
 
 
@@ -200,7 +208,7 @@ PLACING = StageSpec(
     folder="sparse",
     command="reconstruct",
     about="the model placed in the world",
-    version=18,
+    version=19,
     work="reconstruct.placing.run:run_sparse",
     takes=("reconstruct", "water.index_sigma"),
     needs=("image", "mapping"),

@@ -10,18 +10,20 @@ does not change lies in files, of which a task has the paths.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+from numpy.polynomial.legendre import legvander
 from scipy.spatial import KDTree
 
 from alice_survey.core.compiled import compiled
 from alice_survey.core.executor import SERIAL, Executor
 from alice_survey.core.frames import Array
+from camera_calib.camera import Camera
 from camera_calib.freedom import select_slopes, slope_columns
 from camera_calib.rig import Rig
 from reconstruct.adjustment.normal_equations import (
@@ -41,8 +43,10 @@ Value = TypeVar("Value")
 Result = TypeVar("Result")
 _BLOCK = 4096
 """Observations at a time: their intermediate values stay in the cache."""
-PART = 250_000
-"""Observations that are linearised at a time, some: they take 1.2 kB each."""
+PART = 80_000
+"""Observations that are linearised at a time, some: they take 4 kB each."""
+_ORDER = 5
+"""Of the polynomials of keypoints' shifts: a lens's own radial terms but the last."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -119,6 +123,22 @@ class RigState:
     """(F, 3, 3) `world_from_rig`, and (F, 3) where the rig's origins are."""
     centres: Array
     points: Array
+    shifts: Array = field(default_factory=lambda: np.zeros((0, 2, 0)))
+    """(C, 2, K) of the keypoints of each camera, in all its pictures alike: sums of `frame_terms`,
+    pixels; empty where there are none."""
+
+    def with_shifts(self) -> "RigState":
+        """The same with shifts, of no size yet."""
+        terms = (_ORDER + 1) * (_ORDER + 2) // 2
+        return replace(self, shifts=np.zeros((len(self.rig.cameras), 2, terms)))
+
+
+def frame_terms(camera: Camera, pixels: Array) -> Array:
+    """Polynomials over the frame at (N, 2) pixels: (N, K), each of mean square 1, orthogonal."""
+    size, orders = np.array([camera.width_px, camera.height_px]), np.arange(_ORDER + 1)
+    u, v = legvander((2.0 * pixels / size - 1.0).T, _ORDER) * np.sqrt(2 * orders + 1)
+    row, column = np.nonzero(np.add.outer(orders, orders) <= _ORDER)
+    return np.asarray(u[:, row] * v[:, column])
 
 
 def calibrated_parameters(rig: Rig, names: Sequence[str]) -> tuple[str, ...]:
@@ -183,20 +203,27 @@ def exact_residuals(pixels: Pixels, state: RigState, _: None = None) -> Array:
         rows = np.flatnonzero(pixels.camera == c)
         in_rig = np.einsum("nij,ni->nj", state.turns[pixels.station[rows]], arm[rows])
         residuals[rows] = state.rig.cameras[name].project(pose.apply(in_rig)) - pixels.taken[rows]
+        if state.shifts.size:
+            terms = frame_terms(state.rig.cameras[name], pixels.taken[rows])
+            residuals[rows] += terms @ state.shifts[c].T
     return residuals
 
 
 def exact_observations(
     state: RigState, pixels: Pixels, fields: Sequence[str]
 ) -> LinearObservations:
-    """The observations linearised; those that no ray explains do not count."""
+    """The observations linearised; those that no ray explains do not count.
+
+    After the fields come the shifts of the state, where it has some.
+    """
     arm = state.points[pixels.point] - state.centres[pixels.station]
     by_point = np.zeros((len(arm), 2, 3))
-    rest = np.zeros((len(arm), 2, len(fields) + 1))
+    rest = np.zeros((len(arm), 2, len(fields) + state.shifts.size + 1))
     for c, (name, pose) in enumerate(state.rig.cam_from_rig.items()):
         camera, turn = state.rig.cameras[name], pose.rotation.as_matrix()
         source, target = slope_columns(state.rig, fields, name)
-        target = np.append(target, -1)
+        own = len(fields) + np.arange(state.shifts.size).reshape(state.shifts.shape)
+        target = np.concatenate([target, own[c : c + 1].ravel(), [-1]])
         every = np.flatnonzero(pixels.camera == c)
         for first in range(0, len(every), _BLOCK):
             rows = every[first : first + _BLOCK]
@@ -204,8 +231,14 @@ def exact_observations(
             turned = np.einsum("nij,ni->nj", world_from_rig, arm[rows]) @ turn.T
             at, by_cam, by_camera = camera.project_jacobian(turned + pose.translation)
             slopes = select_slopes(source, by_camera, by_cam, turned)
-            miss = (at - pixels.taken[rows])[:, :, None]
-            slopes = np.ascontiguousarray(np.concatenate([slopes, miss], axis=2))
+            terms = np.zeros((len(rows), 0))
+            miss = at - pixels.taken[rows]
+            if state.shifts.size:
+                terms = frame_terms(camera, pixels.taken[rows])
+                miss += terms @ state.shifts[c].T
+            by_shift = np.kron(np.eye(2), terms[:, None])
+            slopes = np.concatenate([slopes, by_shift, miss[:, :, None]], axis=2)
+            slopes = np.ascontiguousarray(slopes)
             _put(rows, by_cam @ turn, world_from_rig, slopes, target, by_point, rest)
     return LinearObservations(
         starts=pixels.starts, station=pixels.station, by_point=by_point, arm=arm, rest=rest
@@ -387,7 +420,10 @@ def _weigh(
 ) -> LinearObservations:
     sigma, variance = noise
     found = exact_observations(state, pixels, fields)
-    return found.weigh(cauchy_weights(found.miss, sigma) / variance)
+    root = np.sqrt(cauchy_weights(found.miss, sigma) / variance)[:, None, None]
+    for slopes in (found.by_point, found.rest):  # in place: a copy takes longer than all else
+        slopes *= root
+    return found
 
 
 def _with_weights(

@@ -5,17 +5,17 @@ wide bounds where it has none. Where anything is free, all uncertain parameters 
 (focal lengths, say) move within its covariance, since holding them would push their errors into
 what is free. The model is then rebuilt on the pinholes of the refined rig.
 
-A detector of features finds texture whose blur, light and scale change from the middle of a picture
-to its edge a little farther in or out than a calibration saw the corners of its target, and does so
-in all pictures alike, so that the number of keypoints does not lessen it. A survey therefore knows
-the radial part of its lenses no better than that, however well a calibration determined it. Ports
-and poses, whose effect depends on the distance, are known as well as stated; with lenses held to
-their own small sigmas, the bias would pull at those instead.
+A detector of features finds texture whose blur, light and scale change over a picture a little off,
+and does so in all pictures alike, so that the number of keypoints does not lessen it: half a
+hundredth of a pixel, fitted as a focal length, an index of the water or a tilt of a port, moves
+surfaces by more than all other noise. Where the rig is free, each camera therefore has shifts of
+its keypoints, a smooth field over the frame with a prior, and the rig moves by what these leave.
 
 A right calibration with covariance P lets pictures move its parameters by d, and leaves the
 covariance Q: d is then normal with covariance P - Q. In the directions that pictures measure, the
 eigenvectors u of P^-1/2 (P - Q) P^-T/2 with eigenvalues above zero, (u . P^-1/2 d)^2 / eigenvalue
-adds up to chi-square.
+adds up to chi-square. Where that contradicts the calibration, its sigmas are too small by the root
+of chi-square over the number of directions, and so are all that follow from them.
 """
 
 import math
@@ -26,6 +26,7 @@ from typing import Self
 
 import numpy as np
 import pycolmap
+from scipy.linalg import block_diag
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.special import chdtrc
 
@@ -75,39 +76,17 @@ from reconstruct.mapping.refraction import Keypoints
 from reconstruct.views.model_files import colmap_pinhole, rigid3d, stored_of
 
 BIAS_PX = 0.01
-"""Sigma of the bias, root mean square over a picture: in rendered surveys it is 0.005 to 0.007."""
-_RADIAL = frozenset({"fx_px", "fy_px", *(f"k{i}" for i in range(1, 7))})
-_GRID = 24
-"""Places along a side of the picture at which a lens is sampled."""
+"""Sigma of the shift of keypoints, root mean square over a picture: in rendered surveys, 0.001 to
+0.007."""
 
 
-def bias_covariance(rig: Rig, names: Sequence[str], sigma_px: float = BIAS_PX) -> Array:
-    """Changes of a rig that are worth a radial bias of keypoints, as a covariance (K, K).
+def shift_information(state: RigState) -> Array:
+    """What is known before the pictures of the shifts of a state, as a matrix (S, S).
 
-    Changes of a lens are as likely as the pixels that they move are near: with J the slopes of the
-    pixels by the lens's L radial parameters, it is `sigma^2 / L` times the inverse of the mean of
-    J^T J, which makes `sigma^2` the expected mean square shift over the picture.
-
-    Args:
-        rig: cameras.
-        names: parameters of the rig; those that are not radial ones of a lens have no bias.
-        sigma_px: of the bias.
+    All are equally likely, which makes `BIAS_PX` squared the expected mean square over the picture.
     """
-    found = np.zeros((len(names), len(names)))
-    for owner, camera in rig.cameras.items():
-        at = {field: names.index(f"{owner}.{field}") for field in camera.lens.parameters
-              if field in _RADIAL and f"{owner}.{field}" in names}  # fmt: skip
-        if not at:
-            continue
-        axes = [(np.arange(_GRID) + 0.5) / _GRID * n for n in (camera.width_px, camera.height_px)]
-        starts, rays = camera.unproject(np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2))
-        lit = np.isfinite(rays).all(axis=1)
-        by_all = camera.project_jacobian(starts[lit] + rays[lit])[2]
-        slopes = by_all[..., [camera.parameters.index(field) for field in at]].reshape(-1, len(at))
-        size = np.linalg.norm(slopes, axis=0)
-        inverse = np.linalg.inv((slopes / size).T @ (slopes / size)) / np.outer(size, size)
-        found[np.ix_([*at.values()], [*at.values()])] = sigma_px**2 / len(at) * lit.sum() * inverse
-    return found
+    cameras = max(1, len(state.shifts))
+    return np.eye(state.shifts.size) * state.shifts.size / cameras / BIAS_PX**2
 
 
 _MEASURED = 0.05
@@ -177,8 +156,8 @@ _RIG_SIGMAS = dict(zip(TURN_AND_SHIFT, [0.02] * 3 + [0.005] * 3, strict=True))
 _BASELINE_SIGMA_M = 1e-7
 """Sigma of an uncalibrated baseline: it is the scale, which no picture determines."""
 _STEPS = 20
-_MAX_PLACES = 100_000
-"""Points whose motions by 65 parameters take 160 MB."""
+_MAX_PLACES = 50_000
+"""Points whose motions by 120 parameters take 150 MB."""
 _SETTLED = 0.05
 """Length of a step of all parameters, in sigmas, at which the adjustment ends."""
 
@@ -205,22 +184,14 @@ class SurveyFit:
     sigma_px: float
     """Sigma of one coordinate of a keypoint."""
     observations: int
+    contradiction: Contradiction | None
+    """What the pictures say against the calibration, by which `covariance` is wider; None where
+    they agree with it."""
 
     @property
     def after(self) -> Array:
         """(G,) adjusted values."""
         return np.array([value(self.state.rig, name) for name in self.parameters])
-
-    @property
-    def prior_sigmas(self) -> Array:
-        """(G,) sigmas of the values before."""
-        return np.sqrt(np.diag(self.prior_covariance))
-
-    @property
-    def contradiction(self) -> Contradiction | None:
-        """What the pictures say against the calibration; None where they agree with it."""
-        change = self.after - self.before
-        return contradiction(self.parameters, change, self.prior_covariance, self.covariance)
 
     @cached_property
     def rig(self) -> Rig:
@@ -250,19 +221,17 @@ class SurveyFit:
         turns, centres, points = modes.move(sizes, state.centres, state.points, rows)
         rig, covariance = state.rig, self.covariance
         if self.parameters:
-            rig = move_rig(rig, self.parameters, modes.calibration @ sizes)
-            gain = np.diag(modes.known) - left
-            covariance = covariance - modes.calibration @ gain @ modes.calibration.T
+            by_rig = modes.calibration[: len(self.parameters)]  # shifts come after
+            rig = move_rig(rig, self.parameters, by_rig @ sizes)
+            covariance = covariance - by_rig @ (np.diag(modes.known) - left) @ by_rig.T
         return replace(
             self,
             covariance=covariance,
-            state=RigState(
-                rig=rig,
-                turns=turns.as_matrix() @ state.turns,
-                centres=centres,
+            state=replace(
+                state, rig=rig, turns=turns.as_matrix() @ state.turns, centres=centres,
                 points=points,
             ),
-        )
+        )  # fmt: skip
 
     @property
     def record(self) -> PortRecord:
@@ -275,7 +244,7 @@ class SurveyFit:
             parameters=self.parameters,
             before=tuple(self.before.tolist()),
             after=tuple(self.after.tolist()),
-            prior_sigmas=tuple(self.prior_sigmas.tolist()),
+            prior_sigmas=tuple(np.sqrt(np.diag(self.prior_covariance)).tolist()),
             sigmas=tuple(known.sigmas.values()),
             correlation=tuple(map(tuple, known.correlation.tolist())),
             contradiction=None if found is None else found.words,
@@ -311,31 +280,40 @@ def fit_survey(
     free = _prior(rig, names, port=port, pose=pose) if port or pose else Prior.around(rig, {})
     pixels, order = pixels.by_place(start.centres)
     start = replace(start, points=start.points[order])
+    before = np.array([value(start.rig, name) for name in free.parameters])
     problem = SurveyProblem(pixels, start, free, workers)
     found = minimise(problem, problem.start, settled=_SETTLED, max_steps=_STEPS)
+    if free.parameters:  # from near by: with shifts a step takes five times as long
+        problem = SurveyProblem(pixels, found.guess.state.with_shifts(), free, workers)
+        found = minimise(problem, problem.start, settled=_SETTLED, max_steps=_STEPS)
     if not found.is_settled:
         warn(f"the last adjustment did not settle in {_STEPS} steps: trust it with care")
     equations, guess = found.equations, found.guess
-    covariance = known = inverse_of(equations.information)
-    fields = problem.fields
+    known, own = inverse_of(equations.information), slice(len(problem.fields))
+    covariance, fields = known[own, own], problem.fields
     if not fields:  # held: what errors of the calibration do, all the same
         fields = calibrated_parameters(rig, names)
-        if rig.covariance is not None:
-            known = calibrated_covariance(rig, fields)
+        guess = replace(guess, state=guess.state.with_shifts())
+        known = inverse_of(calibrated_information(guess.state, fields))
         equations = problem.reduce(guess, found.noise, fields)
     sigma_px, variance = found.noise.tolist()
     weights = cauchy_weights(guess.miss, sigma_px)
+    prior_covariance = inverse_of(problem.information)[own, own]
+    change = np.array([value(guess.state.rig, name) for name in problem.fields]) - before
+    against = contradiction(problem.fields, change, prior_covariance, covariance)
+    wider = 1.0 if against is None else max(1.0, against.chi_square / against.directions)
     return SurveyFit(
         calibrated=rig,
         state=replace(guess.state, points=guess.state.points[np.argsort(order)]),
         point_ids=ids,
         parameters=problem.fields,
-        before=np.array([value(problem.start.state.rig, name) for name in problem.fields]),
-        prior_covariance=inverse_of(problem.information),
-        covariance=covariance,
-        calibration=motions_of(equations, guess.state.points, known) if fields else None,
+        before=before,
+        prior_covariance=prior_covariance,
+        covariance=wider * covariance,
+        calibration=motions_of(equations, guess.state.points, wider * known) if fields else None,
         sigma_px=float(np.sqrt(variance / weights.mean())),
         observations=len(pixels.station),
+        contradiction=against,
     )
 
 
@@ -375,10 +353,11 @@ class SurveyProblem:
     ) -> None:
         self.pixels, self.prior, self.fields = pixels, prior, prior.parameters
         self.parts = PixelParts(pixels, len(state.centres), workers)
-        self.information = prior.information.copy()
-        _hold_baseline(self.information, self.fields, state.rig)
+        known = prior.information.copy()
+        _hold_baseline(known, self.fields, state.rig)
+        self.information = block_diag(known, shift_information(state))
         observed, stations = len(pixels.station), len(state.centres)
-        spare, shared = 2 * observed - 3 * pixels.points - POSE * stations, len(self.information)
+        spare, shared = 2 * observed - 3 * pixels.points - POSE * stations, len(known)
         if spare < 10 * shared:
             raise ReconstructionError(
                 f"{observed} observations of {pixels.points} points from {stations} stations do "
@@ -409,7 +388,7 @@ class SurveyProblem:
         if guess.lost > self.start.lost:
             return math.inf
         sigma, variance = noise
-        off = self.prior.misfit(guess.state.rig)
+        off = self.misfit(guess.state)
         pixels = cauchy_cost(guess.miss, sigma) / variance
         return 0.5 * float(pixels + off @ self.information @ off)
 
@@ -417,8 +396,12 @@ class SurveyProblem:
         """Normal equations with the points eliminated."""
         found = self.reduce(guess, noise, self.fields)
         found.shared[:-1, :-1] += self.information
-        found.shared[:-1, -1] += self.information @ self.prior.misfit(guess.state.rig)
+        found.shared[:-1, -1] += self.information @ self.misfit(guess.state)
         return found
+
+    def misfit(self, state: RigState) -> Array:
+        """How far rig and shifts are from what is expected of them."""
+        return np.concatenate([self.prior.misfit(state.rig), state.shifts.ravel()])
 
     def reduce(self, guess: _Guess, noise: Array, fields: Sequence[str]) -> PointEquations:
         """The same without what is known before the pictures, for any fields of the rig."""
@@ -429,19 +412,21 @@ class SurveyProblem:
 
     def move(self, guess: _Guess, equations: PointEquations, step: BlockStep) -> _Guess:
         """The guess after a step."""
-        state = guess.state
+        state, by_rig, by_shifts = guess.state, *np.split(step.shared, [len(self.fields)])
         return self._observations(
             RigState(
-                rig=move_rig(state.rig, self.fields, step.shared),
+                rig=move_rig(state.rig, self.fields, by_rig),
                 turns=Rotation.from_rotvec(step.poses[:, :3]).as_matrix() @ state.turns,
                 centres=state.centres + step.poses[:, 3:],
                 points=state.points + equations.point_steps(step),
+                shifts=state.shifts + by_shifts.reshape(state.shifts.shape),
             )
         )
 
     def at_bound(self, guess: _Guess) -> Flags:
         """Parameters that have their least value."""
-        return at_bound(guess.state.rig, self.fields)
+        rig = at_bound(guess.state.rig, self.fields)
+        return np.concatenate([rig, np.zeros(guess.state.shifts.size, np.bool_)])
 
 
 def _prior(rig: Rig, names: Sequence[str], *, port: bool, pose: bool) -> Prior:
@@ -460,16 +445,15 @@ def _prior(rig: Rig, names: Sequence[str], *, port: bool, pose: bool) -> Prior:
         }
     wide = {name: sigma for name, sigma in wide.items() if name not in known}
     loose = Prior.around(rig, wide)
-    if not known:
-        return loose
-    prior = Prior.of_rig(rig, known)
-    return replace(prior, covariance=calibrated_covariance(rig, known)).and_also(loose)
+    return Prior.of_rig(rig, known).and_also(loose) if known else loose
 
 
-def calibrated_covariance(rig: Rig, names: Sequence[str]) -> Array:
-    """What a calibration knows of where keypoints lie, as a covariance of its parameters."""
-    bias = bias_covariance(rig, names)
-    return bias if rig.covariance is None else bias + rig.covariance.marginal(names).matrix
+def calibrated_information(state: RigState, names: Sequence[str]) -> Array:
+    """What a calibration and a detector know of where keypoints lie: parameters, then shifts."""
+    rig = np.zeros((0, 0))
+    if state.rig.covariance is not None:
+        rig = inverse_of(state.rig.covariance.marginal(names).matrix)
+    return block_diag(rig, shift_information(state))
 
 
 def _hold_baseline(information: Array, fields: Sequence[str], rig: Rig) -> None:

@@ -680,10 +680,7 @@ def pinhole_survey(
     )
     poses = rig_poses(model, frames).inv()
     state = RigState(
-        rig=rig,
-        turns=poses.rotation.as_matrix(),
-        centres=poses.translation,
-        points=seen.points,
+        rig=rig, turns=poses.rotation.as_matrix(), centres=poses.translation, points=seen.points
     )
     first: dict[int, tuple[bool, int]] = {}
     for image in images:

@@ -206,9 +206,7 @@ def _grow(
         return model
     options.multiple_models = False
     grown = max(
-        model,
-        *map(pycolmap.Reconstruction, _continue_mapping(model, scratch, options)),
-        key=_size,
+        model, *map(pycolmap.Reconstruction, _continue_mapping(model, scratch, options)), key=_size
     )
     if grown.num_reg_images() <= model.num_reg_images():
         return model
@@ -298,9 +296,7 @@ def run_mapper(
 
 
 def _options(
-    cam_from_rig: Mapping[str, RigidTransform] | None,
-    seed: int,
-    free: Free,
+    cam_from_rig: Mapping[str, RigidTransform] | None, seed: int, free: Free
 ) -> pycolmap.IncrementalPipelineOptions:
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed

@@ -209,11 +209,7 @@ def refract(
         model = pycolmap.Reconstruction(mapped.model)
     model.update_point_3d_errors()
     found = RefractionRecord(
-        moved_px=tuple(moves),
-        corrected_px=corrected,
-        removed=removed,
-        added=added,
-        settled=settled,
+        moved_px=tuple(moves), corrected_px=corrected, removed=removed, added=added, settled=settled
     )
     if not settled:
         warn(

@@ -46,13 +46,7 @@ from reconstruct.mapping.working_range import (
 from reconstruct.matching.features import find_features, load_features, save_features
 from reconstruct.matching.learned import Taken, all_pixels, quarter_turns, with_learned
 from reconstruct.matching.matches import PairTask, coarse_matches, match_pair
-from reconstruct.matching.pairs import (
-    SMALL_SET,
-    Pair,
-    alike_pairs,
-    choose_pairs,
-    placed_pictures,
-)
+from reconstruct.matching.pairs import SMALL_SET, Pair, alike_pairs, choose_pairs, placed_pictures
 from reconstruct.matching.refinement import refine_tracks
 from reconstruct.pictures.files import exif_focal_px, list_names
 from reconstruct.pictures.normalise import even_light, finely, normalise, read_deep

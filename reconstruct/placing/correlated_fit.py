@@ -319,8 +319,13 @@ class PlacementProblem:
             total = total.plus(self.group(group, used, how))
         return total
 
-    def _grid(self) -> list[Correlation]:
-        time = self.time
+    def _grid(self, group: str) -> list[Correlation]:
+        """What is tried.
+
+        The place turns with a compass's constant error, so that scatter alone shows, and does not
+        show that there is none: half of a stated variance stays constant, however much scatters.
+        """
+        time, constants = self.time, _CONSTANT[1:] if group == "heading" else _CONSTANT
         steps = np.diff(np.unique(time))
         if not len(steps):
             return [Correlation(tau=1.0, white=0.1)]
@@ -331,7 +336,7 @@ class PlacementProblem:
             Correlation(tau=float(tau), white=white, constant=constant, restart=restart)
             for tau in taus
             for white in _WHITE
-            for constant in _CONSTANT
+            for constant in constants
             for restart in ((0.0, 1.0) if self.dives[-1] else (0.0,))
         ]
 
@@ -340,11 +345,10 @@ class PlacementProblem:
         now = {
             group: how for group, how in correlation.items() if used[:, channels_of(group)].any()
         }
-        grid = self._grid()
         for _ in range(_SWEEPS):
             before = dict(now)
             for group in now:
-                choices = _choices(grid, now[group])
+                choices = _choices(self._grid(group), now[group])
                 scores = self._scores(used, now, group, choices)
                 now[group] = choices[int(np.argmax(scores))]
                 if self.dives[-1]:
@@ -444,10 +448,9 @@ class PlacementProblem:
         The covariance is the mean of those of the single ways and the scatter of their solutions.
         """
         rng = np.random.default_rng(0)  # any draws will do; the same bytes each time
-        grid = self._grid()
         draws: dict[str, list[Correlation]] = {}
         for group, how in correlation.items():
-            choices = _choices(grid, how)
+            choices = _choices(self._grid(group), how)
             scores = self._scores(used, correlation, group, choices)
             weights = np.exp(scores - scores.max())
             picked = rng.choice(len(choices), size=_DRAWS, p=weights / weights.sum())

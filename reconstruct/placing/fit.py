@@ -45,6 +45,8 @@ from reconstruct.placing.navigation import (
     first_placement,
     observable,
     read_epochs,
+    scatter_of_times,
+    with_times_unsure,
 )
 
 _ORDER = (
@@ -607,6 +609,14 @@ def fit_navigation(
         joints=joints,
     )
     near, fit = task.robust(start, free), None
+    scatter_s, scatter_sigma_s = scatter_of_times(epochs, near, installed.clock_s)
+    if scatter_s:
+        warn(
+            f"times of the pictures scatter by {scatter_s:.2g} s against navigation's "
+            f"(clock_sigma_s = {installed.clock_s:g}): what changes fast counts as that unsure; "
+            "import with the times of the trigger, or state a larger clock_sigma_s"
+        )
+        task = replace(task, epochs=with_times_unsure(epochs, near, scatter_s))
     if near.scale >= SHRUNK * start.scale:
         with suppress(ReconstructionError):
             fit = task.fit(near, free)
@@ -616,6 +626,10 @@ def fit_navigation(
             "they of these pictures?"
         )
         return None
+    if scatter_s:
+        scatter = NuisanceRecord(value=scatter_s, sigma=scatter_sigma_s)
+        named = {**fit.stated.nuisances, "time_scatter_s": scatter}
+        fit = replace(fit, stated=fit.stated.model_copy(update={"nuisances": named}))
     return fit if known_scale is not None or control is not None else _with_rough_scale(fit)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from alice_survey.core.block_solver import MAD_TO_SIGMA
 from alice_survey.core.config import ReconstructConfig
 from alice_survey.core.errors import warn
 from alice_survey.core.frames import Array, Datum, rotation_from_attitude
@@ -311,6 +312,45 @@ def _velocities(epochs: Epochs, positions: Array) -> Array:
     return found[epochs.moment]
 
 
+_FEW_SIGMAS = 4.0
+_LOG_SPREAD = 1.64
+"""Sigma of the logarithm of a ratio of two median deviations, times the root of their number."""
+
+
+def scatter_of_times(epochs: Epochs, place: Similarity, known_s: float) -> tuple[float, float]:
+    """Sigma of single times against navigation's, and its own; 0 where it is not above `known_s`.
+
+    Navigation's errors change slowly, and alike in all directions; those of a time act along the
+    way only. Of three readings, the middle one minus what the others say of its time shows both.
+    """
+    first = np.unique(epochs.moment, return_index=True)[1]
+    at, known = epochs.positions(place), epochs.known[:, 0]
+    off, way = (at - epochs.measured_ned)[first, :2], _velocities(epochs, at)[first, :2][1:-1]
+    square = (way**2).sum(axis=1)
+    used = known[2:] & known[1:-1] & known[:-2] & (square > 0)
+    if not used.any():
+        return 0.0, 0.0
+    spread = _LOG_SPREAD / float(np.sqrt(used.sum()))
+    step = np.maximum(np.diff(epochs.time), 1e-9)[:, None]
+    bend = off[1:-1] - (step[1:] * off[:-2] + step[:-1] * off[2:]) / (step[1:] + step[:-1])
+    seconds = np.stack([bend * way, bend[:, ::-1] * way * [1.0, -1.0]]).sum(axis=2)
+    along, across = MAD_TO_SIGMA * np.median(np.abs(seconds[:, used]) / square[used], axis=1)
+    clear = along > across * np.exp(_FEW_SIGMAS * spread)
+    found = float(np.sqrt(max(along**2 - across**2, 0.0) / 1.5))
+    return (found, found * spread / math.sqrt(2.0)) if clear and found > known_s else (0.0, 0.0)
+
+
+def with_times_unsure(epochs: Epochs, place: Similarity, sigma_s: float) -> Epochs:
+    """The same with sigmas that tell of times of such sigma, where readings change fast."""
+    first = np.unique(epochs.moment, return_index=True)[1]
+    turns = (place.rotation * epochs.model_from_body[first]).as_euler("ZYX")[:, ::-1]
+    change = np.abs(np.diff(np.column_stack([epochs.positions(place)[first], turns]), axis=0))
+    change[:, 3:] = np.minimum(change[:, 3:], 2.0 * np.pi - change[:, 3:])
+    rates = np.pad(change / np.maximum(np.diff(epochs.time), 1e-9)[:, None], ((1, 1), (0, 0)))
+    fastest = np.maximum(rates[1:], rates[:-1])
+    return replace(epochs, sigma=np.hypot(epochs.sigma, sigma_s * fastest))
+
+
 def slopes_by_place(away: Array) -> Array:
     """(N, 3, 7) slopes of places (N, 3) about the middle by the placement."""
     slopes = np.zeros((len(away), 3, PLACE))
@@ -371,7 +411,9 @@ def first_placement(
     Returns:
         The placement; None, after a warning, where navigation gives no scale or place.
     """
-    scale, turn, has = known_scale, 0.0, _has_angles(epochs)
+    scale, turn = known_scale, 0.0
+    angles = np.where(epochs.known, 0.0, np.nan)[epochs.moment, 3:].sum(axis=1)
+    has = np.isfinite(angles)
     if epochs.has_horizontal:
         at = epochs.known[epochs.moment, 0]
         count = int(epochs.known[:, 0].sum())
@@ -405,11 +447,6 @@ def first_placement(
         some = np.flatnonzero(has)
         rotation = (epochs.ned_from_body[some] * epochs.model_from_body[some].inv()).mean()
     return _shift(epochs, levelled, scale, rotation)
-
-
-def _has_angles(epochs: Epochs) -> NDArray[np.bool_]:
-    """(N,) whether roll, pitch and heading of a picture are known."""
-    return np.asarray(np.isfinite(np.where(epochs.known, 0.0, np.nan)[epochs.moment, 3:].sum(1)))
 
 
 def _scale_by_relief(epochs: Epochs, levelled: Similarity) -> float | None:

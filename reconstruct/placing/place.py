@@ -313,8 +313,8 @@ def find_place(task: Placing) -> Placed:
     if fit is not None:
         place = fit.ned_from_model
         source = _scale_source(known, ties)
-        if known.scale is None and not ties.informs_scale:
-            source += f", sigma {fit.sigma_scale:.2g}"
+        if not ties.informs_scale and known.held:
+            source += f", sigma {_sigma_of(task, known, fit):.2g}"
         scaled, vertical = True, _VERTICAL_OF_CONTROL
         if local is not None:
             datum = None
@@ -531,6 +531,17 @@ def _scale_source(known: _KnownScale, ties: ControlFit) -> str:
     if not ties.informs_scale:
         return known.source
     return f"{known.source}, corrected by control" if known.scale else "scale from control"
+
+
+def _sigma_of(task: Placing, known: _KnownScale, fit: PlacementFit) -> float:
+    """Relative sigma of a model's scale: of a rig, what its errors do to the stations."""
+    shape = task.adjusted.shape
+    if known.scale is None or shape is None or not shape.modes.calibration.size:
+        return fit.sigma_scale or known.sigma
+    arms = np.stack([pose.translation for pose in task.pinholes])
+    arms = arms - arms.mean(axis=0)
+    soft = picture_modes(shape, task.records, task.pinholes)[:, :3] * shape.modes.known
+    return float(np.linalg.norm(np.einsum("ni,nik->k", arms / (arms**2).sum(), soft)))
 
 
 def _known_scale(workspace: Path, mapping: MappingRecord) -> _KnownScale:

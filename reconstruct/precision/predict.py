@@ -5,7 +5,7 @@ after a dive; navigation of known errors then places it and knows the modes bett
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -15,7 +15,7 @@ from alice_survey.core.block_solver import inverse_of, product_of
 from alice_survey.core.frames import Array
 from reconstruct.adjustment.exact_observations import calibrated_parameters, exact_observations
 from reconstruct.adjustment.normal_equations import LinearObservations, one_part, reduce_points
-from reconstruct.adjustment.survey_fit import calibrated_covariance, motions_of
+from reconstruct.adjustment.survey_fit import calibrated_information, motions_of
 from reconstruct.adjustment.uncertainty import BlockShape, Motions, shape_of_block
 from reconstruct.mapping.arrays import first_of, linked_groups
 from reconstruct.placing.alignment import Similarity, sag_weights
@@ -85,7 +85,8 @@ def predict(
     state, noise_px = block.state, block.noise_px * (1.0 if pixels else _EXACT)
     rig = state.rig
     fields = calibrated_parameters(rig, list(rig.cameras)) if calibration else ()
-    linear = exact_observations(state, block.pixels, fields)
+    block = replace(block, state=state.with_shifts()) if fields else block
+    linear = exact_observations(block.state, block.pixels, fields)
     linear.rest[..., -1] = 0.0
     linear = linear.weigh(np.full(len(block.pixels.station), block.times / noise_px**2))
     motions = _calibration(linear, block, fields) if fields else None
@@ -108,7 +109,7 @@ def _calibration(
     found = reduce_points(linear, len(block.state.centres))
     station, point = block.pixels.station, block.pixels.point
     found.free[first_of(linked_groups(station, point, len(found.free)))] = False
-    found.shared[:-1, :-1] += inverse_of(calibrated_covariance(block.state.rig, fields))
+    found.shared[:-1, :-1] += calibrated_information(block.state, fields)
     return motions_of(found, block.state.points, inverse_of(found.information))
 
 

@@ -27,11 +27,9 @@ from reconstruct.adjustment.exact_observations import (
 )
 from reconstruct.adjustment.normal_equations import PointEquations, reduce_parts
 from reconstruct.adjustment.survey_fit import (
-    BIAS_PX,
     AdjustedSurvey,
     SurveyFit,
     adjust_survey,
-    bias_covariance,
     contradiction,
     fit_survey,
     frees_poses,
@@ -41,7 +39,6 @@ from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.placing.alignment import align_similarity
 from tests.engines import PicklingThreads
 from tests.oracles_place import is_unit
-from tests.reconstruct.rig_survey import four_cameras
 from tests.reconstruct.scenes import Scene, make_scene
 from tests.reconstruct.true_models import DISTANCES, points_of, pupils, refracted, rigid_rms
 
@@ -136,7 +133,8 @@ def test_calibrated_parameters_move_within_their_covariance(tmp_path: Path) -> N
     fit = fit_survey(mapped, seen, wrong, port=False, pose=True)
     assert known.keys() <= set(fit.parameters)
     shared = [fit.parameters.index(n) for n in known]
-    np.testing.assert_allclose(fit.prior_sigmas[shared], [*known.values()])
+    sigmas = np.sqrt(np.diag(fit.prior_covariance))
+    np.testing.assert_allclose(sigmas[shared], [*known.values()])
     assert all(fit.rig.sigmas[n] <= 1.0001 * sigma for n, sigma in known.items())
     assert np.abs(errors_in_sigmas(fit, scene.rig)[shared]).max() < 4.0
 
@@ -293,6 +291,7 @@ def test_ranges_of_one_pair_follow_the_index_as_snells_law_says(tmp_path: Path) 
     rig = knowing_water(scene.rig, SIGMA)
     mapped, seen = refracted(scene, tmp_path)
     moved: Any = fit_survey(mapped, seen, rig, port=False, pose=False).calibration
+    moved = replace(moved, points=moved.points[..., :2], covariance=moved.covariance[:2, :2])
     ned_from_cam = scene.ned_from_cam[0]
     places = ned_from_cam.inv().apply(moved.places)
     ways = ned_from_cam.rotation.inv().apply(moved.points.sum(axis=2))
@@ -335,32 +334,41 @@ def test_scales_lie_within_their_sigmas_where_the_index_is_drawn(tmp_path: Path)
     assert np.sqrt(np.mean(np.square(ignored))) > 1.5
 
 
-def test_changes_of_a_lens_move_pixels_radially_by_the_sigma() -> None:
-    """Drawn from the covariance and seen through the whole camera, port and all."""
-    rig, rng = four_cameras(), np.random.default_rng(4)
-    for owner, camera in rig.cameras.items():
-        fields = [f for f in ("fx_px", "fy_px", "cx_px", "k1", "k2", "p1")
-                  if f in camera.lens.parameters]  # fmt: skip
-        names = [*(f"{owner}.{field}" for field in fields), f"{owner}.n_water"]
-        covariance = bias_covariance(rig, names)
-        assert not covariance[-1].any()
-        assert not covariance[2].any(), "a shift of the whole picture"
-        grid = np.stack(np.meshgrid(*(np.linspace(5, n - 6, 15) for n in (
-            camera.width_px, camera.height_px))), axis=-1).reshape(-1, 2)  # fmt: skip
-        starts, rays = camera.unproject(grid)
-        squares, along = [], []
-        for _ in range(200):
-            step = rng.multivariate_normal(np.zeros(len(names)), covariance)
-            values: dict[str, float] = {
-                f: camera.parameter(f) + s for f, s in zip(fields, step, strict=False)
-            }
-            shift = camera.with_parameters(values).project(starts + 2.0 * rays) - grid
-            out = grid - [camera.parameter("cx_px"), camera.parameter("cy_px")]
-            squares.append((shift**2).sum(axis=1).mean())
-            along.append(np.abs(shift.mean(axis=0)).max() / np.sqrt(squares[-1]))
-            assert np.abs(np.corrcoef(shift[:, 0], out[:, 1])[0, 1]) < 0.5
-        assert np.sqrt(np.mean(squares)) == pytest.approx(BIAS_PX, rel=0.2)
-        assert np.median(along) < 0.35
+LENS = {"fx_px": 0.03, "fy_px": 0.03, "cx_px": 0.05, "cy_px": 0.05, "k1": 1e-4, "k2": 3e-4,
+        "p1": 3e-5, "p2": 3e-5, "port_distance_m": 3e-4, "normal_x": 1e-4,
+        "normal_y": 1e-4}  # fmt: skip
+
+
+def smooth_shift(rng: np.random.Generator, pixels: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """Where a detector puts keypoints at (N, 2) pixels off, alike in all pictures: soft humps."""
+    places, heights = rng.uniform(0, 1, (8, 2)), rng.normal(size=(8, 2))
+    away = ((pixels / size)[:, None] - places) / 0.4
+    return np.exp(-0.5 * (away**2).sum(axis=2)) @ heights
+
+
+@pytest.mark.parametrize("shift_px", [0.0, 0.005])
+def test_shifts_that_pictures_share_move_no_exact_rig_beyond_its_sigmas(
+    tmp_path: Path, shift_px: float
+) -> None:
+    pulls = []
+    for seed in range(3):
+        scene = make_scene(lines=3, stations=5, points=2500, relief_m=0.2, noise_px=0.03, seed=seed)
+        size = np.array([scene.rig.cameras["left"].width_px, scene.rig.cameras["left"].height_px])
+        pixels = list(scene.pixels)
+        for camera in scene.rig.cameras:
+            rows = [k for k, record in enumerate(scene.records) if record.camera == camera]
+            rng = np.random.default_rng([seed, rows[0]])
+            off = smooth_shift(rng, np.concatenate([pixels[k] for k in rows]), size)
+            off *= shift_px / np.sqrt((off**2).sum(axis=1).mean())
+            for k in rows:
+                pixels[k], off = pixels[k] + off[: len(pixels[k])], off[len(pixels[k]) :]
+        scene = replace(scene, pixels=pixels)
+        sigmas = {f"{name}.{f}": s for name in scene.rig.cameras for f, s in LENS.items()}
+        rig = knowing_water(with_sigmas(scene.rig, {**sigmas, **POSES}), 2e-4)
+        mapped, seen = refracted(replace(scene, rig=rig), tmp_path)
+        pulls.append(errors_in_sigmas(fit_survey(mapped, seen, rig, port=False, pose=True), rig))
+    assert np.abs(pulls).max() < 2.5
+    assert np.sqrt(np.mean(np.square(pulls))) < 0.6, "prior errors are none"
 
 
 NAMES = tuple(f"left.p{n}" for n in range(6))
@@ -421,7 +429,10 @@ def test_a_port_stated_too_well_is_named_and_a_right_one_is_not(
     stated = {f"{name}.{field}": s for name in scene.rig.cameras for field, s in STATED.items()}
     rig = with_sigmas(with_camera(scene.rig, "left", **off), stated)
     mapped, seen = modelled(scene, rig, tmp_path)
-    found = fit_survey(mapped, seen, rig, port=True, pose=False).contradiction
+    fit = fit_survey(mapped, seen, rig, port=True, pose=False)
+    found = fit.contradiction
+    off = np.sqrt(np.mean(np.square(errors_in_sigmas(fit, scene.rig))))
+    assert off < (20.0 if about == "" else 2.0), "of 160 and of 20 stated sigmas"
     assert (found is None) == (about is None)
     if found is not None and about is not None:
         assert about in found.words

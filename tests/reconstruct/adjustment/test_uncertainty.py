@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 import pytest
+from scipy.linalg import block_diag
 from scipy.spatial import KDTree
 from scipy.spatial.transform import RigidTransform, Rotation
 
@@ -22,7 +23,12 @@ from reconstruct.adjustment import exact_observations, uncertainty
 from reconstruct.adjustment.exact_observations import Workers, exact_survey
 from reconstruct.adjustment.exact_observations import exact_observations as linearised
 from reconstruct.adjustment.normal_equations import Gauge, LinearObservations, reduce_points
-from reconstruct.adjustment.survey_fit import AdjustedSurvey, adjust_survey, fit_survey
+from reconstruct.adjustment.survey_fit import (
+    AdjustedSurvey,
+    adjust_survey,
+    fit_survey,
+    shift_information,
+)
 from reconstruct.mapping.arrays import cross_matrices, frames_of, observations
 from reconstruct.mapping.bundle import cauchy_weights
 from reconstruct.mapping.mapper import Mapped
@@ -363,7 +369,8 @@ def hessian_of(survey: AdjustedSurvey) -> Array:
         linear.weigh(weights / weights.mean() / fit.sigma_px**2), count
     )
     own = np.array([RIG_SIGMAS[name] for name in fit.parameters])
-    hessian[-len(own) :, -len(own) :] += np.diag(own**-2)
+    known = block_diag(np.diag(own**-2), shift_information(fit.state))
+    hessian[-len(known) :, -len(known) :] += known
     return hessian
 
 
@@ -405,7 +412,8 @@ def test_modes_and_navigation_end_where_all_unknowns_at_once_do(survey: Adjusted
     assert np.linalg.norm((found - wanted)[:, 3:]) < 0.05 * np.linalg.norm(wanted[:, 3:])
     fit = survey.exact.fit
     moved = fit.deform(modes, survey.shape.point_ids, sizes, np.eye(len(sizes)))
-    off = moved.after - fit.after - solved[size - len(RIG_SIGMAS) : size]
+    first = size - fit.state.shifts.size - len(RIG_SIGMAS)
+    off = moved.after - fit.after - solved[first : first + len(RIG_SIGMAS)]
     assert np.all(np.abs(off) < 0.1 * np.sqrt(np.diag(fit.covariance)))
 
 
