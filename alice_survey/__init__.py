@@ -14,14 +14,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from alice_survey.app.api.arrays import (
-        Dem,
-        Mosaic,
-        Track,
-        read_dem,
-        read_mosaic,
-        read_track,
-    )
+    from alice_survey.app.api.arrays import Dem, Mosaic, Track, read_dem, read_mosaic, read_track
     from alice_survey.app.api.figures import plot_dem, plot_mosaic, plot_plan, plot_track
     from alice_survey.app.api.survey import Survey, call
     from alice_survey.core.config import SurveyConfig, load_config

@@ -50,12 +50,7 @@ Adjust = Callable[[Mapped, Observations, Rig, RangeRecord, Datum, Path], Adjuste
 
 
 def adjusted(
-    mapped: Mapped,
-    seen: Observations,
-    rig: Rig,
-    distances: RangeRecord,
-    datum: Datum,
-    folder: Path,
+    mapped: Mapped, seen: Observations, rig: Rig, distances: RangeRecord, datum: Datum, folder: Path
 ) -> Adjusted:
     """Adjust and place a model as `mapping` and `placing` do.
 

@@ -27,15 +27,7 @@ from benchmarks.figures import Figure, Goal
 from camera_calib.calibrate.normal_equations import CalibrationProblem
 from camera_calib.calibrate.solve import Intrinsics, calibrate_through_ports
 from camera_calib.calibration import TargetView, stack_views
-from camera_calib.freedom import (
-    Freedom,
-    Prior,
-    intrinsics,
-    of_cameras,
-    of_ports,
-    pose_names,
-    value,
-)
+from camera_calib.freedom import Freedom, Prior, intrinsics, of_cameras, of_ports, pose_names, value
 from camera_calib.judge.uncertainty import baselines_m
 from camera_calib.rig import Covariance, Rig
 from camera_calib.target_shape import AS_DRAWN, TargetShape, usual_shape

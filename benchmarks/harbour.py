@@ -19,13 +19,7 @@ from typing import Any
 from alice_survey.core.executor import local_executor
 from benchmarks.figures import Figure, Findings, Goal, Parser, hand_over, plain
 from benchmarks.harbour_judge import judge, true_harbour
-from benchmarks.harbour_survey import (
-    Shoot,
-    import_survey,
-    quick_stations,
-    render_survey,
-    stations,
-)
+from benchmarks.harbour_survey import Shoot, import_survey, quick_stations, render_survey, stations
 from benchmarks.measured import measured
 
 _GOALS = {

@@ -80,12 +80,7 @@ SHAPES = (
     Shape(name="strip", first_seed=0, length_m=18.0, width_m=4.0),
     Shape(name="corridor", first_seed=1000, length_m=24.0, width_m=1.5, cross_lines=0),
     Shape(
-        name="square",
-        first_seed=2000,
-        length_m=9.0,
-        width_m=9.0,
-        cross_lines=0,
-        closing_line=False,
+        name="square", first_seed=2000, length_m=9.0, width_m=9.0, cross_lines=0, closing_line=False
     ),
 )
 CROSSED = replace(SHAPES[-1], name="square with four cross lines", cross_lines=4)

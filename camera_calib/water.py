@@ -111,8 +111,7 @@ def water_optics(jerlov: Jerlov, wavelength_nm: Array = WAVELENGTH_NM) -> WaterO
     diffuse = _MEAN_COSINE * diffuse_attenuation_per_m(jerlov, wavelength_nm)
     half = 0.5 * _KIRK * scattering
     return WaterOptics(
-        absorption_per_m=np.sqrt(half**2 + diffuse**2) - half,
-        scattering_per_m=scattering,
+        absorption_per_m=np.sqrt(half**2 + diffuse**2) - half, scattering_per_m=scattering
     )
 
 
@@ -127,10 +126,7 @@ def phase_per_sr(cosine: Array) -> Array:
 
 
 def water_report(
-    temperature_c: float,
-    salinity_psu: float,
-    depth_m: float,
-    jerlov: str,
+    temperature_c: float, salinity_psu: float, depth_m: float, jerlov: str
 ) -> tuple[str, dict[str, Any]]:
     """Index and attenuation of the camera's channels, as text and as JSON values.
 

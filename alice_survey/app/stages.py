@@ -76,10 +76,7 @@ REPORT = StageSpec(
     uses=("mosaic", "mesh", "evaluate"),
     inputs=_report_inputs,
     summary=_report_summary,
-    products={
-        "report.html": "one page that needs no network",
-        "report.pdf": "the same to print",
-    },
+    products={"report.html": "one page that needs no network", "report.pdf": "the same to print"},
 )
 
 

@@ -667,12 +667,7 @@ class SurveyConfig(Config):
             return water
         try:
             index = float(
-                n_water(
-                    water.temperature_c,
-                    water.salinity_psu,
-                    area.seafloor_depth_m,
-                    GREEN_NM,
-                )
+                n_water(water.temperature_c, water.salinity_psu, area.seafloor_depth_m, GREEN_NM)
             )
         except ConfigError as error:
             raise ValueError(str(error)) from None
@@ -696,10 +691,7 @@ REMOVED: Mapping[str, tuple[Any, str]] = {
     "area.no_go_layer": (None, "save the layer as a file of its own"),
     "area.allowed_layer": (None, "save the layer as a file of its own"),
     "area.bathymetry_crs": (None, "set 'crs', which counts for the raster too"),
-    "water.wavelength_nm": (
-        None,
-        "the index is that of green light; else set n_water",
-    ),
+    "water.wavelength_nm": (None, "the index is that of green light; else set n_water"),
     "plan.strobe_lead_s": (0.0002, "it is 0.0002 s: leave it out"),
     "plan.split_dives": (True, _ALWAYS),
     "plan.tie_dives": (True, _ALWAYS),

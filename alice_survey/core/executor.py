@@ -193,9 +193,7 @@ class _Processes(ProcessPoolExecutor):
     def __init__(self, workers: int) -> None:
         with _signals_restored():  # Python's tracker of semaphores changes the mask
             super().__init__(
-                workers,
-                mp_context=multiprocessing.get_context("spawn"),
-                initializer=_start_worker,
+                workers, mp_context=multiprocessing.get_context("spawn"), initializer=_start_worker
             )
 
     def submit(

@@ -20,14 +20,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.kit.document import (
-    Figure,
-    PictureLayer,
-    Report,
-    Section,
-    ShapeLayer,
-    SurveyMap,
-)
+from alice_survey.kit.document import Figure, PictureLayer, Report, Section, ShapeLayer, SurveyMap
 from alice_survey.kit.figure import (
     WIDTH_IN,
     LinearSegmentedColormap,

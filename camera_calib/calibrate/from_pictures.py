@@ -31,12 +31,7 @@ from alice_survey.core.records import BoardRecord
 from camera_calib.calibrate.adjust import UnsettledError
 from camera_calib.calibrate.detect_views import Detections, Size, detect_views
 from camera_calib.calibrate.options import AUTO, CalibrateOptions, CalibrationTask, read_task
-from camera_calib.calibrate.picture_sets import (
-    PictureSet,
-    check_own,
-    find_pictures,
-    pair_pictures,
-)
+from camera_calib.calibrate.picture_sets import PictureSet, check_own, find_pictures, pair_pictures
 from camera_calib.calibrate.results import calibration_text, warn_of_unseen, write_results
 from camera_calib.calibrate.solve import (
     OUTLIER,

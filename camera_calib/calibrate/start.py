@@ -83,11 +83,7 @@ def locate_all(
 
 
 def _refine(
-    rig: Rig,
-    views: Sequence[TargetView],
-    points: Array,
-    start: RigidTransform,
-    settled: float,
+    rig: Rig, views: Sequence[TargetView], points: Array, start: RigidTransform, settled: float
 ) -> tuple[RigidTransform, Array]:
     """Poses of least residuals, and the mean robust length of each view's residuals."""
     adjusted = adjust(views, points, rig, start, HELD, settled, at_most=_STEPS)

@@ -281,12 +281,7 @@ def _refract(
 
 @compiled_ieee
 def dome_slopes(
-    points: Array,
-    leans: Array,
-    port: Array,
-    by_ray: Array,
-    by_point: Array,
-    by_port: Array,
+    points: Array, leans: Array, port: Array, by_ray: Array, by_point: Array, by_port: Array
 ) -> None:
     """Slopes of pixels by the point and the port, from those by the ray in air.
 

@@ -303,12 +303,7 @@ def flat_leave(rays: Array, port: Array, points: Array, directions: Array) -> No
 
 @compiled_ieee
 def flat_slopes(
-    points: Array,
-    turns: Array,
-    port: Array,
-    by_ray: Array,
-    by_point: Array,
-    by_port: Array,
+    points: Array, turns: Array, port: Array, by_ray: Array, by_point: Array, by_port: Array
 ) -> None:
     """Slopes of pixels by the point and the port, from those by the ray in air.
 

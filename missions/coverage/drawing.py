@@ -138,11 +138,7 @@ _CLASSES = 12
 @progress.step("draw the coverage")
 @figure_style()
 def draw_certificate(
-    path: Path,
-    certificate: Certificate,
-    holes: Sequence[Hole],
-    title: str,
-    stations: Stations,
+    path: Path, certificate: Certificate, holes: Sequence[Hole], title: str, stations: Stations
 ) -> None:
     """Draw how many pictures of all cameras see each place, with the holes outlined.
 

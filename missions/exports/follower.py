@@ -83,10 +83,7 @@ def follower_of(vehicle: VehicleConfig, sea: SeaConfig, speed_mps: float) -> Fol
         circle_m=circling_m(gains, speed_mps),
         turn_in_m=turn_in_m(gains, speed_mps),
         turn_rad_s=yaw_rad_s(gains, 1.0),
-        current_ne_mps=(
-            sea.current_mps * math.cos(towards),
-            sea.current_mps * math.sin(towards),
-        ),
+        current_ne_mps=(sea.current_mps * math.cos(towards), sea.current_mps * math.sin(towards)),
         gust_mps=2.0 * sea.current_sigma_mps,
     )
 

@@ -111,9 +111,7 @@ def _waypoint(plan: Plan, point: Waypoint, stays_s: int, tolerance_m: float) -> 
 def _command(command: int, *params: float) -> Item:
     rounded = (round(float(value), 6) for value in params)
     return Item(
-        command=command,
-        frame=FRAME_MISSION,
-        params=(*rounded, *[0.0] * (_PARAMS - len(params))),
+        command=command, frame=FRAME_MISSION, params=(*rounded, *[0.0] * (_PARAMS - len(params)))
     )
 
 

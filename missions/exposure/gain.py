@@ -79,10 +79,7 @@ class GainAdvice:
 
 
 def gain_report(
-    pictures: str | Path,
-    *,
-    present_gain_db: float | None = None,
-    linear: bool = False,
+    pictures: str | Path, *, present_gain_db: float | None = None, linear: bool = False
 ) -> tuple[str, dict[str, Any]]:
     """The gain to set, as text and as JSON values.
 
@@ -118,10 +115,7 @@ def picture_files(pictures: str | Path) -> list[Path]:
 
 
 def gain_advice(
-    files: Sequence[Path],
-    *,
-    present_gain_db: float | None = None,
-    linear: bool = False,
+    files: Sequence[Path], *, present_gain_db: float | None = None, linear: bool = False
 ) -> GainAdvice:
     """The gain to set for pictures like these; as `gain_report`."""
     read = (read_linear(file, linear=linear) for file in progress(files, "control pictures"))

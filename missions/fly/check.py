@@ -195,7 +195,7 @@ def _check_text(check: Check) -> str:
     above = f", {altitude.min():.2f} to {altitude.max():.2f} m above it" if len(altitude) else ""
     lines = [
         f"{record.source}: {len(record.stations)} of {triggered} triggers over the sea "
-        f"floor{above}; triggers: {record.triggers}",
+        f"floor{above}; triggers: {record.triggers}"
     ]
     lines += [
         f"  left out: {count} ({count / triggered:.1%}) {reason}"

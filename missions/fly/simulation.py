@@ -54,12 +54,7 @@ from alice_survey.sim.vehicle.pilot.memory import (
     REASONS,
     SafetyLimits,
 )
-from alice_survey.sim.vehicle.pilot.mission import (
-    MIN_SPEED_MPS,
-    NO_LAW,
-    NO_MISSION,
-    PilotMission,
-)
+from alice_survey.sim.vehicle.pilot.mission import MIN_SPEED_MPS, NO_LAW, NO_MISSION, PilotMission
 from alice_survey.sim.vehicle.pilot.path import Path as PilotPath
 from alice_survey.sim.vehicle.pilot.path import path_from_legs
 from alice_survey.sim.vehicle.pilot.settings import (
@@ -406,8 +401,7 @@ def sensors_of(navigation: NavigationConfig, camera: CameraConfig) -> SensorSuit
             noise_rad=math.radians(navigation.compass_noise_deg),
         ),
         dvl=DvlSpec(
-            position_body_m=camera.dvl_position_body_m,
-            beam_noise_mps=navigation.dvl_noise_mps,
+            position_body_m=camera.dvl_position_body_m, beam_noise_mps=navigation.dvl_noise_mps
         ),
         usbl=UsblSpec(
             rate_hz=_USBL_HZ if navigation.usbl_noise_m else 0.0,

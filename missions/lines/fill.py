@@ -43,12 +43,7 @@ _TINY_M = 1e-9
 
 
 def fill_table(
-    site: Site,
-    heading_rad: float,
-    pattern: Pattern,
-    pieces: Array,
-    offsets: Array,
-    cuts: Array,
+    site: Site, heading_rad: float, pattern: Pattern, pieces: Array, offsets: Array, cuts: Array
 ) -> Array:
     """Lines that see what the rows of a pattern cannot.
 

@@ -119,10 +119,7 @@ def best_heading(task: LineTask) -> Sweep:
         raise faults[0]
     best = _minimum(found, 1)[0]
     return Sweep(
-        heading_rad=best,
-        cost_j=found[best],
-        width_heading_rad=width_heading,
-        width_m=width,
+        heading_rad=best, cost_j=found[best], width_heading_rad=width_heading, width_m=width
     )
 
 

@@ -28,14 +28,7 @@ from numpy.typing import NDArray
 from alice_survey.core.contents import one_line, ordinary_file
 from alice_survey.core.errors import NavigationError, extra, file_faults, warn
 from alice_survey.core.frames import Array, Datum
-from missions.logs.dive import (
-    ROLES,
-    LoggedDive,
-    Signal,
-    angles_of,
-    clean_signal,
-    usable_positions,
-)
+from missions.logs.dive import ROLES, LoggedDive, Signal, angles_of, clean_signal, usable_positions
 from missions.logs.navigation_csv import DATED_AFTER_S
 
 MAX_LOG_BYTES = 4_000_000_000

@@ -83,11 +83,7 @@ def map_report(
 
 @figure_style()
 def plan_figure(
-    plan: Plan,
-    rig: Rig,
-    certificate: Certificate,
-    bathymetry: Bathymetry | None,
-    sea: SeaConfig,
+    plan: Plan, rig: Rig, certificate: Certificate, bathymetry: Bathymetry | None, sea: SeaConfig
 ) -> Sheet:
     """Draw a plan, east to the right, north up.
 

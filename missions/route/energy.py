@@ -169,10 +169,7 @@ class Motion:
 
 
 def vehicle_costs(
-    conditions: FlightConditions,
-    *,
-    refused: Callable[[str], PlanError],
-    imaging_w: float = 0.0,
+    conditions: FlightConditions, *, refused: Callable[[str], PlanError], imaging_w: float = 0.0
 ) -> Costs:
     """What flying takes.
 
@@ -361,9 +358,7 @@ def motion(courses_rad: Array, speed_mps: float, current_ne_mps: Array, manner: 
         return Motion(nu=nu, crab_rad=np.zeros(len(nu)), possible=np.ones(len(nu)))
     nu[:, 0] = np.hypot(ahead, across)
     return Motion(
-        nu=nu,
-        crab_rad=np.arctan2(across, ahead),
-        possible=np.where(ahead > 0.0, 1.0, np.nan),
+        nu=nu, crab_rad=np.arctan2(across, ahead), possible=np.where(ahead > 0.0, 1.0, np.nan)
     )
 
 

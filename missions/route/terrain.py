@@ -184,9 +184,7 @@ def depth_profile(
     """
     gap = float(np.diff(along_m).max(initial=0.0))
     reach = Reach(
-        ahead_m=max(reach.ahead_m, gap),
-        astern_m=max(reach.astern_m, gap),
-        aside_m=reach.aside_m,
+        ahead_m=max(reach.ahead_m, gap), astern_m=max(reach.astern_m, gap), aside_m=reach.aside_m
     )
     highest = highest_floor(bathymetry, points_ne, headings_rad, reach)
     unknown = np.flatnonzero(np.isnan(highest))

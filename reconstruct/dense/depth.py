@@ -139,10 +139,7 @@ def warp(
 
 
 def depth_in_reference(
-    reference: View,
-    partner: View,
-    rectification: Rectification,
-    disparity_px: NDArray[np.float32],
+    reference: View, partner: View, rectification: Rectification, disparity_px: NDArray[np.float32]
 ) -> NDArray[np.float32]:
     """Take a disparity map of the virtual picture to depth along the reference's own axis.
 

@@ -340,11 +340,7 @@ def refine(
 
 
 def _refine_band(
-    one: _Reference,
-    depth: Float32,
-    sigma: Float32,
-    others: Sequence[_Look],
-    spare: Sequence[_Look],
+    one: _Reference, depth: Float32, sigma: Float32, others: Sequence[_Look], spare: Sequence[_Look]
 ) -> RefinedDepth:
     inverse = (1.0 / depth).astype(np.float32)
     first = _sums_of(one, inverse, others, spare)
@@ -401,10 +397,7 @@ def _step(inverse: Float32, sums: _NeighbourSums) -> tuple[Float32, Float32]:
 
 
 def _sums_of(
-    one: _Reference,
-    inverse: Float32,
-    others: Sequence[_Look],
-    spare: Sequence[_Look],
+    one: _Reference, inverse: Float32, others: Sequence[_Look], spare: Sequence[_Look]
 ) -> _NeighbourSums:
     """What the others say, and where none of them sees a spot what the spare ones say."""
     sums = _sums(one, inverse, others)

@@ -62,11 +62,7 @@ def sorted_ranks(values: NDArray[Any]) -> NDArray[np.int64]:
 
 @compiled
 def surfaces_of(
-    heights: Float32,
-    sigmas: Float32,
-    places: NDArray[np.int64],
-    steepness: Float32,
-    cell: float,
+    heights: Float32, sigmas: Float32, places: NDArray[np.int64], steepness: Float32, cell: float
 ) -> tuple[int, NDArray[np.int64]]:
     """Which surface each point of a cell lies on.
 

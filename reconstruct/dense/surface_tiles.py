@@ -130,12 +130,7 @@ _AROUND = np.mgrid[-1:2, -1:2].reshape(2, 9)
 
 
 def look_at_points(
-    points_world: Array,
-    sigmas: Float32,
-    view: View,
-    depth: StoredDepth,
-    factor: float,
-    cell: float,
+    points_world: Array, sigmas: Float32, view: View, depth: StoredDepth, factor: float, cell: float
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Which points a view finds at their place, and which it sees through.
 

@@ -241,11 +241,7 @@ _CELLS = 320
 
 @progress.step("compare with the reference")
 def evaluate_reference(
-    workspace: Path,
-    reference: Path,
-    *,
-    free_scale: bool | None = None,
-    out: Path | None = None,
+    workspace: Path, reference: Path, *, free_scale: bool | None = None, out: Path | None = None
 ) -> tuple[str, dict[str, Any]]:
     """Compare the cloud of a workspace with a LAZ, LAS, PLY or GeoTIFF of the same place.
 

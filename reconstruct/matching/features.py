@@ -37,11 +37,7 @@ class Features:
 
 
 def find_features(
-    grey: NDArray[np.uint8],
-    mask: NDArray[np.bool_] | None,
-    *,
-    maximum: int,
-    thrifty: bool = False,
+    grey: NDArray[np.uint8], mask: NDArray[np.bool_] | None, *, maximum: int, thrifty: bool = False
 ) -> Features:
     """Find SIFT features.
 

@@ -245,9 +245,7 @@ def in_plane(shared: SharedMotions, plane: Plane) -> SharedMotions:
 
 
 def on_lattice(
-    shared: SharedMotions,
-    bounds: tuple[float, float, float, float],
-    nodes: int,
+    shared: SharedMotions, bounds: tuple[float, float, float, float], nodes: int
 ) -> SharedErrors:
     """Motions of points as those of a lattice over a raster.
 

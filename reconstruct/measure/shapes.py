@@ -88,9 +88,7 @@ def profile(surface: MeasuredSurface, vertices: Sequence[Sequence[float]]) -> Su
     places = np.concatenate([*parts, corners[-1:]])
     along = np.concatenate([[0.0], np.cumsum(np.repeat(sides / steps, steps))])
     return SurfaceProfile(
-        samples=surface.at(places),
-        along=along,
-        corners=(0, *np.cumsum(steps).tolist()),
+        samples=surface.at(places), along=along, corners=(0, *np.cumsum(steps).tolist())
     )
 
 

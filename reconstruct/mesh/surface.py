@@ -77,11 +77,7 @@ class TriangleMesh:
 
 
 def mesh_cloud(
-    cloud: CloudFile,
-    step: float,
-    error: float,
-    folder: Path,
-    executor: Executor,
+    cloud: CloudFile, step: float, error: float, folder: Path, executor: Executor
 ) -> tuple[TriangleMesh, list[CellLevel]]:
     """Mesh a cloud.
 

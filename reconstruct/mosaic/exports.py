@@ -150,12 +150,7 @@ Kind = Literal["png", "jpg", "tif"]
 
 
 def mosaic_tiles(
-    workspace: Path,
-    folder: Path,
-    *,
-    side_px: int = 8192,
-    overlap_px: int = 0,
-    kind: Kind = "png",
+    workspace: Path, folder: Path, *, side_px: int = 8192, overlap_px: int = 0, kind: Kind = "png"
 ) -> tuple[str, dict[str, Any]]:
     """Cut the mosaic of a workspace.
 

@@ -21,14 +21,7 @@ from alice_survey.core.artefacts import atomic_path
 from alice_survey.core.run.resources import release_memory
 from reconstruct.light.solve import LightSamples, at_places, joined_samples
 from reconstruct.mosaic.colour import ColourModel
-from reconstruct.mosaic.grid import (
-    ALIGNED_PX,
-    CELL_PX,
-    Block,
-    coarse,
-    dem_around,
-    height_at_pixels,
-)
+from reconstruct.mosaic.grid import ALIGNED_PX, CELL_PX, Block, coarse, dem_around, height_at_pixels
 from reconstruct.mosaic.picture_measures import DARKEST, linear_table, read_small, well_exposed
 from reconstruct.mosaic.seams import Blend, candidates, choose_views
 from reconstruct.mosaic.visibility import (
@@ -418,9 +411,7 @@ def _take_sources(
     return seen_by
 
 
-def _box(
-    used: NDArray[np.bool_],
-) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+def _box(used: NDArray[np.bool_]) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
     """The pixels, and the cells, of a box around cells that are used, on whole aligned pixels."""
     pixels, cells = [], []
     for axis, count in ((1, used.shape[0]), (0, used.shape[1])):

@@ -587,10 +587,7 @@ def import_images(
         )  # fmt: skip
         record.write(partial / Path(ImportRecord.path).name)
         PicturesRecord(
-            source="imported",
-            datum=datum,
-            vertical_datum=level,
-            notes=(*notes, *record.lines),
+            source="imported", datum=datum, vertical_datum=level, notes=(*notes, *record.lines)
         ).write(partial / "survey.json")
 
     changed = artefacts.run_stage(workspace, stage, work)

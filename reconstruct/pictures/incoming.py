@@ -796,10 +796,7 @@ def _compare_with_exif(records: Sequence[ImageRecord], entries: Sequence[Incomin
 
 
 def _times(
-    entries: Sequence[Incoming],
-    log: NavigationLog | None,
-    clock_offset_s: float,
-    zone: tzinfo,
+    entries: Sequence[Incoming], log: NavigationLog | None, clock_offset_s: float, zone: tzinfo
 ) -> tuple[Array, str]:
     """Seconds of every picture on the clock of navigation (else since the first), NaN if unknown.
 
@@ -821,10 +818,7 @@ def _times(
 
 
 def _with_navigation(
-    records: Sequence[ImageRecord],
-    times: Array,
-    log: NavigationLog,
-    named: dict[str, Array] | None,
+    records: Sequence[ImageRecord], times: Array, log: NavigationLog, named: dict[str, Array] | None
 ) -> list[ImageRecord]:
     found = log.at(times) if named is None else named
     has_reading = np.any([np.isfinite(found[name]) for name in READINGS if name in found], axis=0)

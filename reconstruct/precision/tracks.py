@@ -141,8 +141,7 @@ def expected_block(
     origins = ned_from_body * rig.body_from_cam(rig.reference)
     state = RigState(
         rig=replace(
-            rig,
-            cam_from_rig={n: pose * reference.inv() for n, pose in rig.cam_from_rig.items()},
+            rig, cam_from_rig={n: pose * reference.inv() for n, pose in rig.cam_from_rig.items()}
         ),
         turns=origins.rotation.as_matrix(),
         centres=origins.translation,

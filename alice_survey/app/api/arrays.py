@@ -168,10 +168,7 @@ def _read(path: Path, bands: list[int], maximum: int) -> tuple[Any, dict[str, An
         # Whole blocks only, so that cells stay square: less than one at the south and east edges.
         window = Window(0, 0, shape[1] * shrink, shape[0] * shrink)
         values = raster.read(
-            bands,
-            window=window,
-            out_shape=(len(bands), *shape),
-            resampling=Resampling.average,
+            bands, window=window, out_shape=(len(bands), *shape), resampling=Resampling.average
         )
         place = {
             "west": raster.transform.c,

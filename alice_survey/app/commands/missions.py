@@ -88,10 +88,7 @@ class PrecisionCommand(SurveyCommand):
     """
 
     name = "plan precision"
-    examples = (
-        "plan precision -w reef",
-        "plan precision -w reef --no-measures --json",
-    )
+    examples = ("plan precision -w reef", "plan precision -w reef --no-measures --json")
     measures: bool = option(
         True, "Also plan more cross lines, overlap and more, and rank them.",
         "--measures/--no-measures",
@@ -357,10 +354,7 @@ class IdentifyCommand(ReportCommand):
         """Fit and validate."""
         from alice_survey.core.config import DEFAULT_VEHICLE
         from alice_survey.sim.vehicle.identification.output_error import read_prior
-        from alice_survey.sim.vehicle.identification.report import (
-            IdentifyOptions,
-            identify_report,
-        )
+        from alice_survey.sim.vehicle.identification.report import IdentifyOptions, identify_report
 
         options = IdentifyOptions(
             vehicle=self.vehicle or DEFAULT_VEHICLE, coefficients=self.coefficients,

@@ -28,10 +28,7 @@ class InitCommand(WorkspaceCommand):
     """
 
     name = "init"
-    examples = (
-        "init reef --area reef.geojson",
-        "init harbour --example caesarea",
-    )
+    examples = ("init reef --area reef.geojson", "init harbour --example caesarea")
     area: Path | None = option(
         None, "GeoJSON, KML, GPX, GeoPackage, shapefile, WKT or CSV of the area.", metavar="FILE"
     )

@@ -159,10 +159,7 @@ def _comparison(held: Held) -> Section:
         about = "Height minus that of the earlier survey, and how sure it is."
         stills.append((f"against/{name}/change.png", f"Change since {name}", about))
     return Section(
-        name="compared",
-        title="Against other data",
-        tables=tables,
-        figures=_stills(held, *stills),
+        name="compared", title="Against other data", tables=tables, figures=_stills(held, *stills)
     )
 
 

@@ -367,10 +367,7 @@ class Server:
         """
         workspace = Workspace(folder)
         self.studio = Studio(
-            workspace=workspace,
-            layers=Layers(workspace),
-            token=secrets.token_urlsafe(24),
-            log=log,
+            workspace=workspace, layers=Layers(workspace), token=secrets.token_urlsafe(24), log=log
         )
         try:
             self.socket = socket.create_server((ADDRESS, port), backlog=128)

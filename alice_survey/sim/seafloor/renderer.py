@@ -59,11 +59,7 @@ class Rays:
 
 
 def render(
-    scene: Scene,
-    camera: Camera,
-    light: CameraLight,
-    ned_from_cam: RigidTransform,
-    samples: int,
+    scene: Scene, camera: Camera, light: CameraLight, ned_from_cam: RigidTransform, samples: int
 ) -> Floats:
     """Radiance that reaches the pixels of a picture, times the lens's fall-off.
 

@@ -771,10 +771,7 @@ def _lay_amphora(terrain: Terrain, place_ne: Array, rng: np.random.Generator) ->
     level = float(terrain.depth_at(under + terrain.offset_ned[:2]).mean()) - terrain.offset_ned[2]
     laid = turn.apply(vertices - middle) + np.array([*place_ne, level + 0.005])
     return TerrainObject(
-        name="amphora",
-        vertices=laid.astype(np.float32),
-        triangles=triangles,
-        material=CERAMIC,
+        name="amphora", vertices=laid.astype(np.float32), triangles=triangles, material=CERAMIC
     )
 
 

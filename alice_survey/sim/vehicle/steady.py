@@ -102,10 +102,7 @@ def balance_fins(vehicle: Vehicle, speed_mps: float, turn_rad_s: float = 0.0) ->
     def imbalance(unknown: Array) -> Array:
         return forces(unknown)[[1, 2, 4, 5]]
 
-    found = root(
-        imbalance,
-        np.array([0.0, -0.3 * turn_rad_s / max(speed_mps, 1e-9), 0.0, 0.0]),
-    )
+    found = root(imbalance, np.array([0.0, -0.3 * turn_rad_s / max(speed_mps, 1e-9), 0.0, 0.0]))
     if np.abs(found.fun).max() > _BALANCED * (1.0 + np.abs(matrix).max()):
         return None
     nu, angles, pitch = state(found.x)

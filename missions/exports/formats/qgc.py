@@ -49,11 +49,7 @@ def write_qgc(path: Path, export: Export, dive: int) -> None:
             "plannedHomePosition": [round(home[0], 10), round(home[1], 10), 0],
             "items": [_simple(item, i) for i, item in enumerate(export.items(dive), start=1)],
         },
-        "geoFence": {
-            "version": 2,
-            "circles": [],
-            "polygons": _fence(export, first=dive == 0),
-        },
+        "geoFence": {"version": 2, "circles": [], "polygons": _fence(export, first=dive == 0)},
         "rallyPoints": {"version": 2, "points": []},
         "aliceSurvey": {"name": plan.name, "about": mount.about},
     }

@@ -16,12 +16,7 @@ from alice_survey.core.errors import PlanError
 from missions.exports import formats
 from missions.exports.geometry import CameraMount
 from missions.exports.registry import format_names, read_mission
-from missions.exports.waypoints import (
-    DEPTH_STEP_M,
-    bends,
-    min_clearance_by_depth,
-    waypoints,
-)
+from missions.exports.waypoints import DEPTH_STEP_M, bends, min_clearance_by_depth, waypoints
 from missions.exports.write import export_report, write_exports
 from missions.route.terrain import (
     Reach,

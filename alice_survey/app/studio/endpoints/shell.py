@@ -9,13 +9,7 @@ from alice_survey.app.report.held import Held
 from alice_survey.app.report.run import survey_map
 from alice_survey.app.report.shapes import shape_layers
 from alice_survey.app.stages import STAGES
-from alice_survey.app.studio.endpoints.base import (
-    Call,
-    Content,
-    Endpoint,
-    Studio,
-    TileRequest,
-)
+from alice_survey.app.studio.endpoints.base import Call, Content, Endpoint, Studio, TileRequest
 from alice_survey.app.studio.files import STAGES_MADE
 from alice_survey.kit.document import EAST_NORTH, PictureLayer, ShapeLayer
 from alice_survey.kit.map import map_data, map_extent

@@ -164,8 +164,7 @@ class _StartPage:
         """What an import would find, and whether folders inside look like those of a rig."""
         asked = call.read(_Arguments).root
         given = cast(
-            ImportImagesCommand,
-            command_of("import-images", asked, self.studio.workspace.folder),
+            ImportImagesCommand, command_of("import-images", asked, self.studio.workspace.folder)
         )
         folders = given.folders or []
         rig = cameras_in(folders[0]) if len(folders) == 1 and not given.recursive else {}

@@ -236,11 +236,7 @@ class Window:
 
 
 def make_windows(
-    log: VehicleLog,
-    vehicle: Vehicle,
-    *,
-    window_s: float | None = None,
-    given: Sequence[str] = (),
+    log: VehicleLog, vehicle: Vehicle, *, window_s: float | None = None, given: Sequence[str] = ()
 ) -> list[Window]:
     """Cut a log into windows; warns of rows that are left out.
 

@@ -48,11 +48,7 @@ from numpy.typing import NDArray
 from alice_survey.core.compiled import columns
 from alice_survey.core.errors import VehicleError
 from alice_survey.core.frames import Array
-from alice_survey.sim.vehicle.allocation import (
-    AXIS_WEIGHTS,
-    LEVEL_WEIGHTS,
-    new_allocation,
-)
+from alice_survey.sim.vehicle.allocation import AXIS_WEIGHTS, LEVEL_WEIGHTS, new_allocation
 from alice_survey.sim.vehicle.dynamics import Body, coriolis_matrix
 from alice_survey.sim.vehicle.fins import Fins, fin_slope, pack_fins, write_fin_matrix
 from alice_survey.sim.vehicle.propulsion import thrust_limits
@@ -349,11 +345,7 @@ def _integral(rate: float, place: float, omega: float, max_decay: float) -> floa
 
 
 def heading_loop(
-    body: Body,
-    speed_mps: float,
-    row: Array,
-    fins: Fins = NO_FINS,
-    plane: tuple[int, int] = LATERAL,
+    body: Body, speed_mps: float, row: Array, fins: Fins = NO_FINS, plane: tuple[int, int] = LATERAL
 ) -> Array:
     """State matrix of the heading loop with the sway that it brings about; or of pitch and heave.
 

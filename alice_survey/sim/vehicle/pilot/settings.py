@@ -320,10 +320,7 @@ def _under_way(gains: Gains, path: Path, tightest_per_m: float) -> UnderWay:
 
 
 def stop_speeds(
-    gains: Gains,
-    lever_m: float,
-    by_sway: bool,
-    turn_in_place_rad_s: float = TURN_IN_PLACE_RAD_S,
+    gains: Gains, lever_m: float, by_sway: bool, turn_in_place_rad_s: float = TURN_IN_PLACE_RAD_S
 ) -> tuple[float, float]:
     """Rate of turns on the spot and speed of sway steps that a vehicle can do.
 

@@ -182,10 +182,7 @@ def write_point(estimate: Array, guidance: Guidance, pilot: PilotState) -> None:
     p, point = guidance.point_body_m, pilot.point
     sr, cr = math.sin(estimate[vector.ROLL]), math.cos(estimate[vector.ROLL])
     sp, cp = math.sin(estimate[vector.PITCH]), math.cos(estimate[vector.PITCH])
-    sy, cy = (
-        math.sin(estimate[vector.HEADING]),
-        math.cos(estimate[vector.HEADING]),
-    )
+    sy, cy = (math.sin(estimate[vector.HEADING]), math.cos(estimate[vector.HEADING]))
     ahead = cp * p[0] + sp * (sr * p[1] + cr * p[2])
     abeam = cr * p[1] - sr * p[2]
     u, v, w = estimate[vector.U], estimate[vector.V], estimate[vector.W]

@@ -87,8 +87,7 @@ def assert_planned_as_by_command(workspace: Path, elsewhere: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "edit",
-    [pytest.param(e, marks=pytest.mark.slow if e != "corridor" else ()) for e in EDITS],
+    "edit", [pytest.param(e, marks=pytest.mark.slow if e != "corridor" else ()) for e in EDITS]
 )
 def test_a_saved_plan_is_the_command_lines(
     workspace: Path, server: Server, tmp_path: Path, edit: str

@@ -10,12 +10,7 @@ from alice_survey.core.errors import WorkspaceError
 from alice_survey.core.frames import rotation_from_attitude
 from alice_survey.sim.seafloor.as_built import true_rig
 from alice_survey.sim.seafloor.light import backscatter_at, backscatter_of_row, camera_light
-from alice_survey.sim.seafloor.renderer import (
-    Scene,
-    camera_rays,
-    flat_floor_radiance,
-    render,
-)
+from alice_survey.sim.seafloor.renderer import Scene, camera_rays, flat_floor_radiance, render
 from alice_survey.sim.seafloor.terrain import Terrain, TerrainObject, build_terrain
 from alice_survey.sim.seafloor.texture import Texture
 from camera_calib.rig import design_rig
