@@ -313,7 +313,9 @@ _MAX_PLACES = 2000
 """Places at most at which the motions that points share are kept: they are smooth."""
 
 
-_SHARED = ("shared_places", "shared_motions", "shared_cov", "shared_rest")
+_SHARED = (
+    "shared_places", "shared_motions", "shared_cov", "shared_rest", "shared_calibration",
+)  # fmt: skip
 _STORED = {
     "frames": "frames", "stations": "stations", "images": "images", "cov": "frame_cov",
     "point_ids": "point_ids", "point_cov": "point_cov", "point_noise": "point_noise",
@@ -338,6 +340,8 @@ class SharedMotions:
     """(K, K) of these, in their sigmas."""
     rest: Array
     """(M, 3, 3) covariances of what poses do to the points besides."""
+    calibration: Array | None = None
+    """(G, G) covariance of the rig's parameters, then of shifts of keypoints; None: unknown."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -374,6 +378,9 @@ class Uncertainty:
             covariance = shared.covariance.copy()
             covariance[: len(left), : len(left)] = left
             shared = replace(shared, covariance=covariance)
+            if shared.calibration is not None and len(modes.calibration):
+                change = modes.calibration @ gain @ modes.calibration.T
+                shared = replace(shared, calibration=shared.calibration - change)
         return replace(
             self,
             frame_cov=self.frame_cov - spread(modes.stations, gain),
@@ -588,6 +595,7 @@ def _shared_motions(
     return SharedMotions(
         points[rows], motions, covariance,
         covariances[rows] - noise[rows] - spread(motions, covariance),
+        None if shape is None else shape.covariance,
     )  # fmt: skip
 
 
@@ -611,7 +619,8 @@ def write_uncertainty(path: Path, found: Uncertainty) -> None:
         key: np.asarray(getattr(found, name)) for key, name in _STORED.items()
     }
     if found.shared is not None:
-        arrays |= dict(zip(_SHARED, vars(found.shared).values(), strict=True))
+        shared = zip(_SHARED, vars(found.shared).values(), strict=True)
+        arrays |= {key: value for key, value in shared if value is not None}
     for key in arrays.keys() & {"point_cov", "point_noise", "shared_motions"}:
         arrays[key] = arrays[key].astype(np.float32)
     np.savez(path, **arrays)

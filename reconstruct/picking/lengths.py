@@ -100,7 +100,7 @@ class StationBlock:
     state: RigState
     fields: tuple[str, ...]
     covariance: Array
-    """(G, G) of the rig's parameters `fields`."""
+    """(G, G) of the rig's parameters `fields`, then of the shifts of keypoints, where known."""
     equations: PointEquations
     gauge: Gauge
 
@@ -132,7 +132,11 @@ class StationBlock:
         sigma = 1.0  # of no effect on one station, which has no shape
         if len(numbers) > 1:
             path = workspace / "sparse" / "covariance.npz"
-            sigma = float(read_arrays(path, "sigma_px")["sigma_px"])
+            stored = read_arrays(path, "sigma_px", optional=("shared_calibration",))
+            sigma = float(stored["sigma_px"])
+            if len(known) and "shared_calibration" in stored:
+                state = state.with_shifts()
+                known = stored["shared_calibration"].astype(np.float64)
         parts = PixelParts(pixels, len(numbers))
         linear = linearise_parts(parts, state, fields, (sigma, sigma**2))
         group = linked_groups(pixels.station, pixels.point, len(numbers))

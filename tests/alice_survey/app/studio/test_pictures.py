@@ -157,7 +157,7 @@ def test_stations_around_a_spot_are_known_as_the_model_states(workspace: Path) -
     for row, station in enumerate(stated.stations.tolist()):
         where = np.zeros((6, len(block.numbers), 6))
         where[:, np.searchsorted(block.numbers, station)] = np.eye(6)
-        poses, rig = block.variances(where, np.zeros((6, len(block.fields))))
+        poses, rig = block.variances(where, np.zeros((6, len(block.covariance))))
         ratio = np.sqrt(np.diag(poses + rig) / np.diag(stated.frame_cov[row]))
         assert np.all((ratio > 0.85) & (ratio < 1.15))
 
