@@ -27,7 +27,7 @@ def test_every_bound_that_is_broken_fails_the_check(tmp_path: Path) -> None:
             structure.ROOT / name, copy / name,
             ignore=shutil.ignore_patterns("__pycache__", "node_modules"),
         )  # fmt: skip
-    for name in ("pyproject.toml", "README.md"):
+    for name in ("pyproject.toml", "README.md", "CONTRIBUTING.md"):
         shutil.copy(structure.ROOT / name, copy / name)
     room = copy / "alice_survey" / "core"
 
@@ -70,6 +70,8 @@ def test_every_bound_that_is_broken_fails_the_check(tmp_path: Path) -> None:
     insert(copy / "pyproject.toml", "layers = [\n", '    "nowhere_at_all",\n' * 9)
     phrase = "There is a way out.\n"
     append(copy / "README.md", phrase * excess("lines of docs with an avoided phrase"))
+    sentence = f"\nOne{' more' * 36} word.\n" * excess("sentences of docs over 35 words")
+    append(copy / "README.md", sentence)
 
     run = subprocess.run(
         [sys.executable, "-m", "tests.structure"],

@@ -245,8 +245,7 @@ def _port_verdicts(judged: Judgement) -> Iterator[Verdict]:
         spread_m = _SIGMAS * rig.sigmas.get(f"{name}.port_distance_m", np.inf)
         if np.isfinite(spread_m):
             distance_m = camera.parameter("port_distance_m")
-            at_pupil = distance_m <= camera.port.minimum("port_distance_m")
-            if (at_pupil and spread_m < _NEAREST_GLASS_M) or distance_m > _MAX_GLASS_M + spread_m:
+            if not _NEAREST_GLASS_M - spread_m < distance_m <= _MAX_GLASS_M + spread_m:
                 yield _bad(
                     f"the flat port of {name} ended {distance_m * 1e3:.2g} mm before the pupil, "
                     "where no housing has glass: the pictures are through a dome, without a port, "

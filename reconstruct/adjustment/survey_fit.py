@@ -142,11 +142,12 @@ def contradiction(
     along = directions[:, measured].T @ (white @ change)
     total = float((along**2 / gain[measured]).sum())
     count = int(measured.sum())
-    if count == 0 or chdtrc(count, total) > _UNLIKELY:
-        return None
     pulls = change / sigmas
     order = np.argsort(-np.abs(pulls))
-    far = [int(k) for k in order if abs(pulls[k]) > _FAR][:_MAX_NAMED] or [int(order[0])]
+    far = [int(k) for k in order if abs(pulls[k]) > _FAR][:_MAX_NAMED]
+    # Parameters that go together are known to thousandths of a pixel: alone that shows nothing.
+    if count == 0 or not far or chdtrc(count, total) > _UNLIKELY:
+        return None
     named = {parameters[k]: float(pulls[k]) for k in far}
     return Contradiction(chi_square=total, directions=count, pulls=named)
 
