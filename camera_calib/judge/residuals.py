@@ -41,7 +41,7 @@ _OUTLYING = 6.0
 """Outlier limit of length over median length: 7 sigmas of normal noise."""
 _HALF_STEP_PX = 0.5
 _RINGS = 6
-"""Radial fields: as many as can be told from the usual lenses' four terms, and from one another."""
+"""Radial fields that differ from the four terms of the usual lenses, and from one another."""
 
 
 def within_gate(residuals_px: Array, noise_px: Array | float) -> NDArray[np.bool_]:
