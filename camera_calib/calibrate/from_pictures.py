@@ -77,7 +77,7 @@ def calibrate_pictures(
         if options.mount is not None:
             rig = with_mount(calibration.rig, options.mount, options.lever_m)
             calibration = replace(calibration, rig=rig)
-        write_results(partial, calibration, found)
+        calibration = write_results(partial, calibration, found)
     _check_useful(calibration, found, output)
     verdicts = read_json(output / "report.json")["verdicts"]
     text = calibration_text(calibration, task.target, verdicts)

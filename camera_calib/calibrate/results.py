@@ -23,7 +23,7 @@ from camera_calib.judge.uncertainty import (
     rig_parameters,
     shape_parameters,
 )
-from camera_calib.judge.validation import hold_out
+from camera_calib.judge.validation import halves_agreement, hold_out
 from camera_calib.ports.dome import DomePort
 from camera_calib.ports.none import NoPort
 from camera_calib.rig import Rig, write_rig
@@ -44,16 +44,23 @@ def warn_of_unseen(found: Detections) -> None:
             warn(f"view {rejection.view}, {rejection.camera}: {rejection.reason}; left out")
 
 
-def write_results(folder: Path, calibration: Calibration, found: Detections) -> None:
+def write_results(folder: Path, calibration: Calibration, found: Detections) -> Calibration:
     """Write `rig.json`, `calibration.json`, `corners.csv` and the report (docs/formats.md).
 
-    What was left out, or is not determined, is a warning each.
+    What was left out, or is not determined, is a warning each. Sigmas are widened where either half
+    of the views gives another calibration than the sigmas allow.
 
     Args:
         folder: an existing folder.
         calibration: what was found.
         found: all views in which the target was seen, also those that took no part.
+
+    Returns:
+        The calibration as written.
     """
+    held = hold_out(calibration.views, lambda views: recalibrate(calibration, views), locate)
+    if held is not None and held.halves is not None:
+        calibration = _widened(calibration, halves_agreement(held.halves).widening)
     lost = [r for r in calibration.rejections if r.points]
     if lost:
         views = ", ".join(dict.fromkeys(r.view for r in lost))
@@ -67,8 +74,20 @@ def write_results(folder: Path, calibration: Calibration, found: Detections) -> 
     write_rig(folder / "rig.json", whole.rig)
     CalibrationRecord.save(folder / "calibration.json", summary(whole))
     write_csv(folder / "corners.csv", _CORNERS, _corner_rows(whole, found.views))
-    held = hold_out(whole.views, lambda views: recalibrate(whole, views), locate)
     write_report(folder, whole, held)
+    return whole
+
+
+def _widened(calibration: Calibration, factor: float) -> Calibration:
+    """Sigmas times a factor, except for what both halves of the views have in common."""
+    covariance = calibration.rig.covariance
+    if factor == 1.0 or covariance is None:
+        return calibration
+    common = calibration.shared @ calibration.shared.T
+    matrix = common + factor**2 * (covariance.matrix - common)
+    rig = replace(calibration.rig, covariance=replace(covariance, matrix=matrix))
+    line = f"halves of the views disagree: the rig's sigmas are {factor:.2f} times as large"
+    return replace(calibration, rig=rig, warnings=(*calibration.warnings, line))
 
 
 def summary(calibration: Calibration) -> dict[str, Any]:

@@ -299,8 +299,9 @@ def _hold_out_verdicts(judged: Judgement) -> Iterator[Verdict]:
         yield _test(
             halves.p_value,
             f"parameters from either half of the views differ by chi2 {halves.chi2:.1f} for "
-            f"{halves.parameters}",
-            ": the sigmas are too small; did lens, port or target change between views?",
+            f"{halves.parameters}"
+            + (f", sigmas are {halves.widening:.2f} times as large" if halves.widening > 1 else ""),
+            ": did lens, port or target change between views?",
         )
 
 

@@ -31,6 +31,8 @@ _EVERY = 5
 """One view in this many is held out."""
 _MIN_KNOWN = 1e-12
 """Least eigenvalue over the largest of a covariance scaled to unit variances; less is rounding."""
+_P_WIDER = 0.05
+"""Level of the test that widens sigmas: for one exact calibration in twenty, too."""
 
 Calibrate = Callable[[Sequence[TargetView]], Calibration]
 Locate = Callable[[Rig, TargetView, Array], RigidTransform]
@@ -154,6 +156,11 @@ class HalvesAgreement:
     """Mean of `chi2`, if the covariances are true."""
     p_value: float
     """Probability of as large a difference, if the covariances are true."""
+
+    @property
+    def widening(self) -> float:
+        """Factor for the sigmas: Birge's ratio where chance seldom makes such a difference."""
+        return float((self.chi2 / self.parameters) ** 0.5) if self.p_value < _P_WIDER else 1.0
 
 
 def halves_agreement(halves: tuple[Calibration, Calibration]) -> HalvesAgreement:

@@ -1,10 +1,14 @@
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from alice_survey.core.errors import CalibrationError
+from camera_calib.calibrate.detect_views import Detections
+from camera_calib.calibrate.results import write_results
+from camera_calib.calibrate.solve import recalibrate
 from camera_calib.calibrate.start import locate
 from camera_calib.calibration import Calibration, TargetView
 from camera_calib.freedom import Freedom, Prior, intrinsics, of_cameras, of_ports, pose_names, value
@@ -16,6 +20,7 @@ from camera_calib.judge.validation import (
     length_errors,
     score_hold_out,
 )
+from camera_calib.rig import read_rig
 from tests.oracles_report import (
     DESIGN,
     SQUARE_M,
@@ -127,6 +132,37 @@ def test_the_same_calibration_twice_does_not_differ_and_drawn_ones_do_by_chance(
     assert np.mean([one.chi2 for one in agree]) == pytest.approx(len(names), rel=0.08)
     assert np.std([one.chi2 for one in agree]) == pytest.approx((2 * len(names)) ** 0.5, rel=0.3)
     assert 0.4 < np.mean([one.p_value for one in agree]) < 0.6
+
+
+@pytest.mark.parametrize("longer", [0.0, 0.02])
+def test_sigmas_are_wider_where_halves_disagree(longer: float, tmp_path: Path) -> None:
+    """Every other view was taken with a focal length that is 2 % longer."""
+    rig, moved = true_rig(), {}
+    for name in rig.cameras:
+        fx_px, fy_px = (rig.cameras[name].parameter(one) for one in ("fx_px", "fy_px"))
+        moved |= {f"{name}.fx_px": longer * fx_px, f"{name}.fy_px": longer * fy_px}
+    made, other = (synthetic_views(one, 14, 0.1, 1) for one in (rig, moved_rig(rig, moved)))
+    views = [pair[i % 2] for i, pair in enumerate(zip(made.views, other.views, strict=True))]
+    found = adjusted(views, made.points, DESIGN, all_free(DESIGN))
+    found = replace(found, rig=replace(found.rig, body_from_rig=None))
+    sizes = {name: (camera.width_px, camera.height_px) for name, camera in rig.cameras.items()}
+
+    write_results(tmp_path, found, Detections(views=tuple(views), sizes=sizes, rejections=()))
+
+    written, covariance = read_rig(tmp_path / "rig.json").covariance, found.rig.covariance
+    assert written is not None
+    assert covariance is not None
+    first, second = (recalibrate(found, views[i::2]) for i in range(2))
+    apart = [value(second.rig, one) - value(first.rig, one) for one in moved]
+    sigmas = np.array([[one.rig.covariance.sigmas[m] for m in moved] for one in (first, second)])
+    ratios = np.array([written.sigmas[one] / covariance.sigmas[one] for one in moved])
+    if longer:
+        assert np.ptp(ratios) < 1e-3
+        # Chi-squared is at least the square of any parameter's own difference.
+        least = np.abs(apart / np.hypot(*sigmas)).max() / len(covariance.parameters) ** 0.5
+        assert 1.2 < least < ratios[0] < 3.0 * least
+    else:
+        assert ratios.tolist() == [1.0] * 4
 
 
 @pytest.mark.parametrize("enough", [8, 14])
