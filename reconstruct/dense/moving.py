@@ -37,7 +37,7 @@ _SAME_DEPTH = 0.02
 """Relative difference up to which depths are those of one surface."""
 _DARKEST = 6.0
 """Grey level below which differences are noise."""
-_MIN_CELLS = 200
+_MIN_CELLS = 50
 """Cells that a view must share with another for their light to be compared."""
 _FITTED_CELLS = 4000
 _FIT_ROUNDS = 6
@@ -45,10 +45,10 @@ _MIN_SIGMA = 0.02
 """Of logarithms of light: what differs less is never told apart."""
 _SEED, _GROWN = 4.5, 2.2
 """Standard deviations from which cells differ, and to which what differs is grown."""
-_SEED_SHARE, _MIN_AREA = 0.3, 12
-"""Of the cells of a part, those that differ by far; and its cells. In other light, differences
-that fade out are many."""
-_GAP_CELLS, _RIM_CELLS = 5, 3
+_SEED_SHARE, _MIN_AREA = 0.3, 4
+"""Of the compared cells of a part, those that differ by far; and its cells. In other light,
+differences that fade out are many."""
+_GAP_CELLS, _RIM_CELLS = 3, 2
 """Gaps in a part that are closed; and around it, where its rim is blended with what is behind."""
 _MAX_SHARE = 0.5
 """A view that differs in more of what is compared differs otherwise."""
@@ -89,6 +89,13 @@ class Look(NamedTuple):
         """Rows and columns."""
         return self.depth.shape[0], self.depth.shape[1]
 
+    @property
+    def every_other(self) -> "Look":
+        """One in four of the cells, the upper left."""
+        one = slice(None, None, 2)
+        light, usable, depth = self.light[one, one], self.usable[one, one], self.depth[one, one]
+        return Look(self.view, 2 * self.step, light, usable, depth)
+
 
 def mask_moving(workspace: Path, folder: Path, task: ViewTask) -> MovingShare:
     """Find what moves in a view; write its mask where anything does.
@@ -109,7 +116,7 @@ def mask_moving(workspace: Path, folder: Path, task: ViewTask) -> MovingShare:
     if not found.any():
         return MovingShare(image=view.image, masked=0.0, compared=compared)
     pictures = Pictures.open(workspace)
-    at = _lattice_as_taken(pictures.warp(view.image)) * view.pinhole.size_px / look.step
+    at = _lattice_as_taken(pictures.warp(view.image)) * view.pinhole.size_px / (2 * look.step)
     with np.errstate(invalid="ignore"):
         inside = np.asarray(((at >= 0) & (at < found.shape[::-1])).all(axis=-1))
     columns, rows = np.where(inside[..., None], at, 0).astype(np.int64).transpose(2, 0, 1)
@@ -201,19 +208,20 @@ def moving_parts(look: Look, others: Sequence[Look]) -> tuple[Mask, float]:
     """Where a view shows what others do not.
 
     Args:
-        look: the view.
+        look: the view; one in four of its cells is compared.
         others: views at other stations that see the same surface.
 
     Returns:
-        (h, w) mask, and the share of the cells that could be compared.
+        (h / 2, w / 2) mask, and the share of the cells that could be compared.
     """
-    still = still_depth(look, others)
-    rows, columns = np.nonzero(np.isfinite(still) & look.usable)
+    fewer = look.every_other
+    still = still_depth(fewer, [other.every_other for other in others])
+    rows, columns = np.nonzero(np.isfinite(still) & fewer.usable)
     nothing = np.zeros(still.shape, np.bool_)
     depth = still[rows, columns]
-    pixels: Array = (np.column_stack([columns, rows]).astype(np.float64) + 0.5) * look.step
+    pixels: Array = (np.column_stack([columns, rows]).astype(np.float64) * 2 + 0.5) * look.step
     points = look.view.at_depth(pixels, depth.astype(np.float64))
-    own, places = look.light[rows, columns], pixels / look.view.pinhole.size_px
+    own, places = fewer.light[rows, columns], pixels / look.view.pinhole.size_px
     shown, stations, sigmas = [], [], []
     for other in others:
         cells, log_ratio = cells_at(points, depth, other)
