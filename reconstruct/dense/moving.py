@@ -39,7 +39,7 @@ _DARKEST = 6.0
 """Grey level below which differences are noise."""
 _MIN_CELLS = 50
 """Cells that a view must share with another for their light to be compared."""
-_FITTED_CELLS = 4000
+_FITTED_CELLS = 1500
 _FIT_ROUNDS = 6
 _MIN_SIGMA = 0.02
 """Of logarithms of light: what differs less is never told apart."""
