@@ -149,10 +149,10 @@ class Held:
 
 @dataclass(frozen=True, kw_only=True)
 class Surface:
-    """Figures of the DEM."""
+    """Figures of the DEM, of the planned area alone where there is a plan."""
 
     area: float
-    """Area of its known cells, square units."""
+    """Area of all known cells, square units."""
     cell: float
     low: float
     high: float
@@ -183,24 +183,26 @@ def _surface(held: Held) -> Surface:
             blocks = [raster.read(1, window=window) for raster in (dem, sigma, seen)]
             there = np.isfinite(blocks[0])
             known += int(there.sum())
-            kept.append(np.stack([block[there][::_KEPT].astype(np.float64) for block in blocks]))
+            judged = there
             if area is not None:
                 rows, columns = np.mgrid[: there.shape[0], : there.shape[1]] + 0.5
                 cells = dem.window_transform(window)
                 east, north = cells.c + cells.a * columns, cells.f + cells.e * rows
                 inside = shapely.contains_xy(area, east, north)
                 requested += int(inside.sum())
-                reached += int((inside & there).sum())
+                judged = there & inside
+                reached += int(judged.sum())
+            kept.append(np.stack([block[judged][::_KEPT].astype(np.float64) for block in blocks]))
     if area is not None:  # what lies beyond the raster counts too
         requested = max(requested, round(area.area / cell**2))
     height, spread, stations = np.concatenate(kept, axis=1)
-    low, high = np.percentile(height, [0.5, 99.5]) if known else (math.nan, math.nan)
+    low, high = np.percentile(height, [0.5, 99.5]) if len(height) else (math.nan, math.nan)
     spread = spread[np.isfinite(spread)]
     middle, most = np.percentile(spread, [50, 95]) if len(spread) else (math.nan, math.nan)
     return Surface(
         area=known * cell**2, cell=cell, low=float(low), high=float(high),
         sigma_median=float(middle), sigma_95=float(most),
-        unchecked=float(np.mean(stations < _MIN_STATIONS)) if known else math.nan,
+        unchecked=float(np.mean(stations < _MIN_STATIONS)) if len(height) else math.nan,
         covered=reached / requested if requested else math.nan,
     )  # fmt: skip
 

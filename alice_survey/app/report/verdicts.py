@@ -177,10 +177,11 @@ def _surface(held: Held) -> Iterator[Verdict]:
             "Fly lower or with more overlap for better heights.",
         )
     if surface.unchecked > _MAX_UNCHECKED:
+        which = "planned area" if math.isfinite(surface.covered) else "surface"
         yield _verdict(
-            f"{share(surface.unchecked)} of the surface are seen from fewer than three stations: "
+            f"{share(surface.unchecked)} of the {which} are seen from fewer than three stations: "
             "nothing checks their heights",
-            "Plan more forward overlap, or a margin beyond the area.",
+            "Plan more overlap, or a margin beyond the area.",
         )
 
 

@@ -1,9 +1,12 @@
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+import rasterio
 
 from alice_survey.app.report.held import Held
+from alice_survey.core.artefacts import write_json
 from tests.alice_survey.app.report.tiny import CELL_M, COLUMNS, ROWS, SIGMA_M, SLOPE, tiny_workspace
 
 
@@ -21,6 +24,24 @@ def test_area_relief_and_cover_are_those_of_the_plane(held: Held) -> None:
     assert surface.high - surface.low == pytest.approx(SLOPE * COLUMNS * CELL_M, rel=0.06)
     assert surface.sigma_median == pytest.approx(SIGMA_M, rel=1e-6)
     assert surface.unchecked == 0.0
+
+
+def test_what_lies_beyond_the_planned_area_is_not_judged(tmp_path: Path) -> None:
+    """The northern half is planned; cells of the southern one are seen by two stations, and bad."""
+    folder, north, east = tiny_workspace(tmp_path), ROWS * CELL_M, COLUMNS * CELL_M
+    plan = json.loads((folder / "plan/plan.json").read_text())
+    ring = [[north / 2, 0.0], [north, 0.0], [north, east], [north / 2, east], [north / 2, 0.0]]
+    plan["area"]["survey"]["coordinates"] = [[ring]]
+    write_json(folder / "plan/plan.json", plan)
+    for name, value in (("stations", 2), ("sigma", 1.0)):
+        with rasterio.open(folder / f"dense/{name}.tif", "r+") as raster:
+            band = raster.read(1)
+            band[ROWS // 2 :] = value
+            raster.write(band, 1)
+    surface = Held.of(folder).surface
+    assert surface is not None
+    assert (surface.unchecked, surface.covered) == (0.0, 1.0)
+    assert surface.sigma_95 == pytest.approx(SIGMA_M, rel=1e-6)
 
 
 def test_place_on_earth_is_the_rms_of_the_cameras_level_sigmas(held: Held) -> None:
