@@ -22,7 +22,6 @@ from missions.route.turns import Manoeuvre, Zones
 from missions.route.ways import TOUCH_M, Ways
 from missions.values.area import Area, multipolygon
 from missions.values.costs import Costs
-from missions.values.legs import Route
 from missions.values.line import Line
 from missions.values.pattern import Pattern
 from missions.values.plan_file import Dive
@@ -72,7 +71,7 @@ def plan_parts(
     whole, tied = PlannedDives(lines=(), dives=(), sweep=None), True
     for number, (part, home) in enumerate(parts):
         more = _plan_part(part, settings, pattern, costs, home, usable_wh, depth_m, zones)
-        dives = (_from_line(dive, len(whole.lines)) for dive in more.dives)
+        dives = (dive.from_line(len(whole.lines)) for dive in more.dives)
         tied = tied and all(
             after.first_line == before.last_line + 1 and more.lines[after.first_line].kind == "tie"
             for before, after in pairwise(more.dives)
@@ -175,21 +174,6 @@ def with_ties(planned: PlannedDives) -> PlannedDives:
         own = list(planned.lines[dive.first_line : dive.last_line + 1])
         if dives and dive.first_line <= planned.dives[len(dives) - 1].last_line:
             own[0] = replace(own[0], kind="tie")
-        dives.append(_from_line(dive, len(lines) - dive.first_line))
+        dives.append(dive.from_line(len(lines) - dive.first_line))
         lines += own
     return replace(planned, lines=tuple(lines), dives=tuple(dives))
-
-
-def _from_line(dive: Dive, count: int) -> Dive:
-    """A dive whose lines are counted from another one on."""
-    if count == 0:
-        return dive
-    legs = [
-        replace(leg, line=leg.line + count) if leg.line >= 0 else leg for leg in dive.route.legs
-    ]
-    return replace(
-        dive,
-        first_line=dive.first_line + count,
-        last_line=dive.last_line + count,
-        route=Route(legs=tuple(legs)),
-    )

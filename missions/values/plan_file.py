@@ -4,7 +4,7 @@ Altitude and all places are of the left port's outer glass.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +52,14 @@ class Dive:
     def home_ne_m(self) -> tuple[float, float]:
         """Place where the vehicle is launched and recovered."""
         return self.route.legs[0].start_ne_m
+
+    def from_line(self, count: int) -> "Dive":
+        """The same with its lines counted from another one on."""
+        legs = tuple(
+            replace(leg, line=leg.line + count) if leg.line >= 0 else leg for leg in self.route.legs
+        )
+        first, last = self.first_line + count, self.last_line + count
+        return replace(self, first_line=first, last_line=last, route=Route(legs=legs))
 
     def to_json(self) -> dict[str, Any]:
         """The dive as `plan.json` holds it."""

@@ -36,7 +36,6 @@ from alice_survey.kit import words
 from camera_calib.freedom import part_of_rig
 from camera_calib.rig import Rig, read_rig, write_rig
 from missions.logs.navigation_csv import NavigationLog, find_zone, read_navigation
-from missions.values.legs import Route
 from missions.values.plan_file import Plan, read_plan
 from reconstruct.pictures import files, incoming
 from reconstruct.pictures.videos import (
@@ -787,25 +786,10 @@ def _join_plans(workspace: Path, dives: Sequence[Path]) -> None:
 
 
 def _with_lines(first: Plan, second: Plan) -> Plan:
-    count = len(first.lines)
-    dives = tuple(
-        replace(
-            dive,
-            first_line=dive.first_line + count,
-            last_line=dive.last_line + count,
-            route=Route(
-                legs=tuple(
-                    replace(leg, line=leg.line + count if leg.line >= 0 else -1)
-                    for leg in dive.route.legs
-                )
-            ),
-        )
-        for dive in second.dives
-    )
     return replace(
         first,
         lines=first.lines + second.lines,
-        dives=first.dives + dives,
+        dives=(*first.dives, *(dive.from_line(len(first.lines)) for dive in second.dives)),
         line_depths_m=(),
         length_m=first.length_m + second.length_m,
         duration_s=first.duration_s + second.duration_s,
