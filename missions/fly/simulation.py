@@ -11,9 +11,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-import shapely
 from scipy.spatial.transform import RigidTransform, Rotation
-from shapely.geometry import LineString, Point
+from shapely.geometry import Point
 
 from alice_survey.core.config import (
     AreaConfig,
@@ -80,6 +79,7 @@ from missions.coverage.stations import MAX_ALTITUDES, Stations, plan_pattern, st
 from missions.exports.follower import cola2_delta_m, cola2_settings, expected_m, follower_of, sways
 from missions.exports.geometry import CameraMount
 from missions.exports.registry import read_mission
+from missions.exports.waypoints import room_m
 from missions.plan.planner import area_bathymetry
 from missions.route.energy import (
     flies_everywhere,
@@ -797,7 +797,6 @@ def covered_shares(plan: Plan, rig: Rig, stations: Stations) -> dict[str, float]
 
 
 _SAME_RAD = 1e-6
-_TOUCH_M = 1e-6
 _SAME_HOME_M = 0.01
 
 
@@ -929,12 +928,9 @@ def room_behind_m(plan: Plan, path: PilotPath, max_m: float) -> float:
         path: its first leg's course.
         max_m: the most that is of use.
     """
-    start = np.array([path.start_n[0], path.start_e[0]])
     course = float(path.heading_rad[0])
-    end = start - max_m * np.array([math.cos(course), math.sin(course)])
-    inside = LineString([start, end]).intersection(plan.area.touched)
-    parts = [part for part in shapely.get_parts(inside) if part.distance(Point(start)) <= _TOUCH_M]
-    return min(max_m, max((float(part.length) for part in parts), default=0.0))
+    ahead = np.array([math.cos(course), math.sin(course)])
+    return room_m(plan, np.array([path.start_n[0], path.start_e[0]]), -max_m * ahead)
 
 
 def roomier_side(
