@@ -135,7 +135,7 @@ class Disturbance:
 
 
 @kernel
-def _bracket(axis: Array, value: float) -> tuple[int, float]:
+def bracket(axis: Array, value: float) -> tuple[int, float]:
     """The cell of an axis that holds a value, and how far into it; (0, 0) on a single point."""
     last = axis.shape[0] - 1
     if last == 0 or value <= axis[0]:
@@ -162,8 +162,8 @@ def current_at(current: Current, time_s: float, depth_m: float, out: Array) -> N
         depth_m: depth.
         out: (6,) north and east velocity, their rates by time, and their slopes by depth.
     """
-    i, a = _bracket(current.time_s, time_s)
-    j, b = _bracket(current.depth_m, depth_m)
+    i, a = bracket(current.time_s, time_s)
+    j, b = bracket(current.depth_m, depth_m)
     grid = current.velocity_ne_mps
     i1, j1 = min(i + 1, grid.shape[0] - 1), min(j + 1, grid.shape[1] - 1)
     # No slope beyond the ends, where the current is constant.

@@ -58,6 +58,7 @@ from alice_survey.sim.vehicle.pilot.steering import (
     write_wrench,
 )
 from alice_survey.sim.vehicle.rotations import wrap_angle
+from alice_survey.sim.vehicle.sea import bracket
 
 _STEP_M = 1000.0
 """Progress of a step of a mission that is done, above the length of any."""
@@ -274,17 +275,10 @@ def _target_m(path: Path, guidance: Guidance, pilot: PilotState) -> float:
     at_m, planned_m = path.profile_at_m, math.inf
     begins_m = path.begins_m[int(pilot.report[slot.LEG])] + pilot.report[slot.ALONG]
     for place in (begins_m, begins_m + _AHEAD_M):
-        low, high = 0, at_m.shape[0] - 1
-        while high - low > 1:
-            middle = (low + high) // 2
-            if at_m[middle] <= place:
-                low = middle
-            else:
-                high = middle
-        if high > 0:
-            share = min(max((place - at_m[low]) / (at_m[high] - at_m[low]), 0.0), 1.0)
-            deepest = path.profile_m[low] + share * (path.profile_m[high] - path.profile_m[low])
-            planned_m = min(planned_m, deepest)
+        if at_m.shape[0] > 1:
+            low, share = bracket(at_m, place)
+            step_m = path.profile_m[low + 1] - path.profile_m[low]
+            planned_m = min(planned_m, path.profile_m[low] + share * step_m)
     if pilot.memory[slot.FLOOR_KNOWN] == 0.0:
         limits = guidance.limits
         return float(min(limits.blind_depth_m, limits.max_depth_m - _CAUTION_M, planned_m))
