@@ -1,7 +1,6 @@
 """Coordinate systems: from those of files and settings to latitude and longitude, then to NED."""
 
 import contextlib
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -10,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.core.errors import PlanError, warn
-from alice_survey.core.frames import Array, Datum
+from alice_survey.core.frames import Array, Datum, distances_m
 from missions.areas.raw import RawShapes
 
 LOCAL = "local"
@@ -75,14 +74,15 @@ class LocalFrame:
         return raw.change(change, geographic=False)
 
     def _check_near(self, corners: Array, points_ne: Array, raw: RawShapes, name: str) -> None:
+        datum_deg = np.array([self.datum.latitude_deg, self.datum.longitude_deg])
         if raw.geographic:
-            far_m = _distance_m(corners, self.datum)
+            far_m = distances_m(corners, datum_deg)
         else:
             far_m = np.linalg.norm(points_ne, axis=1)
         advice = "move the datum (latitude_deg, longitude_deg), or check the corner and its crs"
         if not self.datum_is_given:
             advice = "the area is too large, or a corner or its crs is wrong"
-        if raw.geographic and _distance_m(corners[:, ::-1], self.datum).max(initial=0.0) <= MAX_M:
+        if raw.geographic and distances_m(corners[:, ::-1], datum_deg).max(initial=0.0) <= MAX_M:
             advice = "latitude and longitude are swapped"
         max_m, datum = far_m.max(initial=0.0), self.datum
         refuse_corners(
@@ -234,15 +234,3 @@ def middle(raw: RawShapes) -> Datum:
         round(float(centre_lat), _DATUM_DECIMALS),
         round((float(centre_lon) + 180.0) % 360.0 - 180.0, _DATUM_DECIMALS),
     )
-
-
-def _distance_m(lat_lon: Array, datum: Datum) -> Array:
-    """(N,) great circle distances on a sphere, good to 0.5 %, to separate near from far."""
-    radius_m = 6_371_000.0
-    lat, lon = np.deg2rad(lat_lon.T)
-    lat_0, lon_0 = math.radians(datum.latitude_deg), math.radians(datum.longitude_deg)
-    haversine = (
-        np.sin((lat - lat_0) / 2) ** 2
-        + np.cos(lat) * math.cos(lat_0) * np.sin((lon - lon_0) / 2) ** 2
-    )
-    return np.asarray(2 * radius_m * np.arcsin(np.sqrt(np.clip(haversine, 0.0, 1.0))))
