@@ -85,12 +85,6 @@ class DepthProfile:
         """(S,) height of the glass above the highest floor within reach."""
         return self.highest_floor_m - self.depth_m
 
-    @property
-    def slopes_rad(self) -> Array:
-        """(S - 1,) slopes of the profile, positive downwards."""
-        slopes: Array = np.arctan2(np.diff(self.depth_m), np.diff(self.along_m))
-        return slopes
-
 
 def reach_of(
     hull: Hull, glass_body_m: Sequence[float], half_swath_m: float, half_along_m: float

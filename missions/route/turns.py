@@ -149,12 +149,7 @@ def route_of(legs: Array) -> Route:
 
 
 def legs_through(
-    table: Array,
-    how: Manoeuvre,
-    *,
-    home_ne: tuple[float, float] | None = None,
-    start_ne: tuple[float, float] | None = None,
-    first_line: int = 0,
+    table: Array, how: Manoeuvre, *, home_ne: tuple[float, float] | None = None, first_line: int = 0
 ) -> Array:
     """The legs of the route along all lines in order.
 
@@ -163,7 +158,6 @@ def legs_through(
         how: turns, what they cost, and where they are allowed.
         home_ne: where the route begins and ends; None: at the first line's run-in, and run-out
             behind the last.
-        start_ne: where it begins, if that is not home.
         first_line: index of the first of these lines in the plan.
 
     Returns:
@@ -185,9 +179,9 @@ def legs_through(
         if how.ways.free_many(ends[-1:, :2], leaving[:, :2])[0]:
             finish = _straight(ends[-1:, :2], np.append(leaving[:, :2], ends[-1:, 2:], axis=1))
     else:
-        leave, enter = np.array([[*(start_ne or home_ne), np.nan]]), np.array([[*home_ne, np.nan]])
+        home = np.array([[*home_ne, np.nan]])
         (begin, *hops, finish), kinds = _hops(
-            np.concatenate([leave, ends]), np.concatenate([starts, enter]), how
+            np.concatenate([home, ends]), np.concatenate([starts, home]), how
         )
         kinds = kinds[1:-1]
     _warn_of_others(kinds, how.turns)

@@ -76,24 +76,19 @@ def scratch_for(actuators: int) -> Scratch:
     return Scratch(np.zeros((5, STATE + actuators)), np.zeros(6), np.zeros(6), np.zeros(6))
 
 
-def initial_state(
-    position_ned: Array, attitude_rad: Array, actuators: int, nu: Array | None = None
-) -> Array:
-    """A state, thrusters at rest and fins not turned.
+def initial_state(position_ned: Array, attitude_rad: Array, actuators: int) -> Array:
+    """A state at rest in the water, thrusters and fins as well.
 
     Args:
         position_ned: (3,) metres.
         attitude_rad: (3,) roll, pitch, heading.
         actuators: number of thrusters and drives of fins.
-        nu: (6,) velocity relative to the water; at rest if not given.
     """
     from alice_survey.core.frames import rotation_from_attitude
 
     state = np.zeros(STATE + actuators)
     state[:3] = position_ned
     state[3:7] = rotation_from_attitude(*attitude_rad).as_quat()
-    if nu is not None:
-        state[7:13] = nu
     return state
 
 

@@ -88,7 +88,9 @@ def state_of(
     position_ned: tuple[float, float, float] = (0.0, 0.0, 5.0),
     rps: Array | None = None,
 ) -> Array:
-    state = initial_state(np.array(position_ned), np.array(attitude_rad), vehicle.actuators, nu)
+    state = initial_state(np.array(position_ned), np.array(attitude_rad), vehicle.actuators)
+    if nu is not None:
+        state[7:13] = nu
     if rps is not None:
         state[13:] = rps
     return state
