@@ -336,15 +336,22 @@ def _signals_restored() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _as_workers_start() -> Iterator[None]:
-    """Have processes started meanwhile take one core each, and leave Ctrl-C to this one."""
+    """Have processes started meanwhile take one core each, and leave Ctrl-C to this one.
+
+    They do not run the user's script, which would start them again.
+    """
     before = {name: os.environ.get(name) for name in _CORES}
     os.environ.update(dict.fromkeys(_CORES, "1"))
+    script = vars(sys.modules["__main__"])
+    path = script.pop("__file__", None) if script.get("__spec__") is None else None
     try:
         with _signals_restored():
             if hasattr(signal, "pthread_sigmask"):
                 signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
             yield
     finally:
+        if path is not None:
+            script["__file__"] = path
         for name, value in before.items():
             if value is None:
                 os.environ.pop(name, None)

@@ -45,6 +45,17 @@ def test_results_come_in_order(threads: int) -> None:
     ]
 
 
+def test_processes_do_not_run_a_users_script(tmp_path: Path) -> None:
+    """A script need not guard its work by `if __name__ == "__main__"`."""
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from alice_survey.core.executor import local_executor\n"
+        "print(list(local_executor(2).map(abs, [-3, 2], label='abs')), __file__)\n"
+    )
+    ended = subprocess.run([sys.executable, script], capture_output=True, text=True)
+    assert ended.stdout == f"[3, 2] {script}\n"
+
+
 def _process(_: int) -> int:
     time.sleep(0.05)
     return os.getpid()
