@@ -2,9 +2,9 @@
 
     python -m tests.docs.measured
 
-A file holds a group: `title`, `about` and `sections`, each of which has a `title`, maybe a `note`,
-and `rows` of `claim`, `value` and maybe `spread`. `machine`, `date` and `command` are the section's,
-or the row's own. A value holds for the version of its date.
+A file holds a group: `title`, `about` and `sections`, each of which has a `title`, maybe a
+`note`, and `rows` of `claim`, `value` and maybe `spread`. `machine`, `date` and `command` are the
+section's, or the row's own. A value holds for the version of its date.
 """
 
 import json
@@ -16,23 +16,27 @@ from tests.docs.pages import DOCS
 KEPT = DOCS.parent / "benchmarks" / "kept" / "measured"
 FOLDER = DOCS / "measured"
 ORDER = (
-    "first-minutes", "demo", "surveys", "scenes", "large", "clusters", "peers", "camera", "housings",
-    "colour", "navigation", "vehicle", "planning", "studio", "reliability",
+    "first-minutes", "demo", "surveys", "scenes", "large", "clusters", "peers", "camera",
+    "housings", "colour", "navigation", "vehicle", "planning", "studio", "reliability",
 )  # fmt: skip
 _HEAD = ["| claim | number (spread) | machine, date | command |", "|---|---|---|---|"]
 _LONGEST_COMMAND = 60
 _NOTICE = "<!-- made by `python -m tests.docs.measured` from benchmarks/kept/measured -->"
-_INDEX = f"""{_NOTICE}
-# Measured
+_INDEX = f"""# Measured
+{_NOTICE}
+
 Every figure with the machine, the date and the command that measured it. A figure holds for the
 version of its date: later versions may differ. Where nothing else is said, a machine has two cores
 of an AMD EPYC and no GPU; "busy" means that other programs used them at the time.
-`python -m benchmarks --work W` runs all comparisons and tabulates them with their spread.
+`python -m benchmarks --work W` runs all comparisons and tabulates them with their spread. A ditto
+mark stands for the cell above.
 
 | page | what |
 |---|---|
 """
-_LAST = "| [Other programs](other-programs.md) | What other programs do on large surveys, quoted. |\n"
+_LAST = (
+    "| [Other programs](other-programs.md) | Other programs on large surveys, quoted. |\n"
+)
 
 
 def group_of(name: str) -> dict[str, Any]:
@@ -44,10 +48,13 @@ def group_of(name: str) -> dict[str, Any]:
 def page_of(name: str) -> str:
     """A group as a page in Markdown."""
     group, commands = group_of(name), list[str]()
-    lines = [_NOTICE, f"# {group['title']}", group["about"]]
+    lines = [f"# {group['title']}", _NOTICE, "", group["about"]]
     for section in group["sections"]:
         lines += ["", f"## {section['title']}", *_HEAD]
-        lines += [_line(section | row, commands) for row in section["rows"]]
+        rows = [_cells(section | row, commands) for row in section["rows"]]
+        for above, row in zip([[""] * 4, *rows], rows, strict=False):
+            same = ['"' if i > 1 and row[i] == above[i] else row[i] for i in range(4)]
+            lines.append(f"| {' | '.join(same)} |")
         lines += ["", section["note"]] if "note" in section else []
     if commands:
         lines += ["", "## Commands"]
@@ -55,8 +62,8 @@ def page_of(name: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _line(row: dict[str, str], commands: list[str]) -> str:
-    """A row; a long command goes to the list at the page's end."""
+def _cells(row: dict[str, str], commands: list[str]) -> list[str]:
+    """The cells of a row; a long command goes to the list at the page's end."""
     number = row["value"] + (f" ({row['spread']})" if "spread" in row else "")
     command = row["command"]
     if len(command) > _LONGEST_COMMAND:
@@ -65,7 +72,7 @@ def _line(row: dict[str, str], commands: list[str]) -> str:
         shown = f"[{commands.index(command) + 1}](#commands)"
     else:
         shown = _code(command)
-    return f"| {row['claim']} | {number} | {row['machine']}, {row['date']} | {shown} |"
+    return [row["claim"], number, f"{row['machine']}, {row['date']}", shown]
 
 
 def _code(command: str) -> str:
