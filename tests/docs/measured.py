@@ -34,9 +34,7 @@ mark stands for the cell above.
 | page | what |
 |---|---|
 """
-_LAST = (
-    "| [Other programs](other-programs.md) | Other programs on large surveys, quoted. |\n"
-)
+_LAST = "| [Other programs](other-programs.md) | Other programs on large surveys, quoted. |\n"
 
 
 def group_of(name: str) -> dict[str, Any]:
