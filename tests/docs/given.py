@@ -159,28 +159,16 @@ def _own_pictures(folder: Path, made: Made) -> None:
     files.photos(made.reef, folder / "photos", FEW, late_s=late_s)
     files.photos(made.reef, folder / "shallow", FEW, gps=True)
     files.masks(folder / "photos", folder / "masks")
-    files.film(made.reef, folder / "dive.mp4", FEW)
     files.navigation(made.reef, folder / "navigation.csv", dated=True)
     shutil.copy(made.small_rig, folder / "rig.json")
+    given_divers.chapters(folder)
+    given_divers.card(folder / "card")
     _few_features(folder)
 
 
 def _robots(folder: Path, made: Made) -> None:
     files.robot_bag(made.reef, folder / "dive.bag", FEW, SMALL_PX)
     shutil.copy(made.small_rig, folder / "rig.json")
-    _few_features(folder)
-
-
-def _divers(folder: Path, made: Made) -> None:
-    given_divers.chapters(folder)
-    given_divers.card(folder / "card")
-    _few_features(folder)
-
-
-def _no_navigation(folder: Path, made: Made) -> None:
-    """The model that the page on real pictures made, without the length it was given."""
-    _bring(folder, made.after("real-pictures.md") / "dive")
-    (folder / "dive/scale.json").unlink()
     _few_features(folder)
 
 
@@ -213,8 +201,7 @@ GIVEN: dict[str, Callable[[Path, Made], None]] = {
     "how-to/big-survey.md": _big_survey,
     "how-to/cluster.md": _reef,
     "how-to/colour-camera.md": _colour_camera,
-    "how-to/divers.md": _divers,
-    "how-to/no-navigation.md": _no_navigation,
+    "how-to/no-navigation.md": _stereo,
     "how-to/other-programs.md": _reef,
     "how-to/own-camera.md": _own_camera,
     "how-to/own-pictures.md": _own_pictures,
@@ -224,9 +211,8 @@ GIVEN: dict[str, Callable[[Path, Made], None]] = {
     "certificate.md": _certificate,
     "energy.md": _planned,
     "logs.md": _logs,
-    "real-pictures.md": _stereo,
     "reconstruction.md": _reconstruction,
-    "vehicle-logs.md": _identified,
+    "identification.md": _identified,
     "studio.md": _reef,
 }
 """By page."""

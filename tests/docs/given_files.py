@@ -159,17 +159,6 @@ def masks(pictures: Path, folder: Path) -> None:
         Image.fromarray(mask).save(folder / f"{path.stem}.png")
 
 
-def film(reef: Path, path: Path, stations: Iterable[int]) -> None:
-    """Write a film of four frames a second."""
-    pictures = [cv2.imread(str(reef / f"images/left/{s:06d}.png")) for s in stations]
-    height, width = pictures[0].shape[:2]
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 4.0, (width, height))
-    for picture in pictures:
-        for _ in range(4):
-            writer.write(picture)
-    writer.release()
-
-
 def navigation(reef: Path, path: Path, *, dated: bool) -> None:
     """Write the navigation of the flight at 4 Hz, with dates instead of seconds if requested."""
     header, *rows = (reef / "flight/navigation.csv").read_text().splitlines()
