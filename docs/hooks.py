@@ -6,7 +6,11 @@ Nothing is fetched to show them.
 """
 
 import html
+import inspect
+import json
 import re
+from collections.abc import Iterator
+from typing import Any
 
 from latex2mathml.converter import convert
 from mkdocs.config.defaults import MkDocsConfig
@@ -24,9 +28,13 @@ _AFTER = re.compile(
 )
 _GAP = '<mspace width="0.17em" />'
 _BAR = re.compile(r'<mo(?: stretchy="false")?>(&#x02016;|&#x0007C;)</mo>')
-_STAGES = "<!-- stages: a table, made when the site is built -->"
-_FORMATS = "<!-- export formats: a table, made when the site is built -->"
-_RASTERS = "<!-- rasters: a table, made when the site is built -->"
+_TABLE = re.compile(r"<!-- ([\w ]+): made when the site is built -->")
+_OPTION_HEAD = ["| option | value | default | what |", "|---|---|---|---|"]
+_SETTING_HEAD = ["| setting | default | range | what |", "|---|---|---|---|"]
+_SHARED = {
+    "--workspace", "-w", "-s", "--survey", "--threads", "--scheduler", "--cluster", "--device",
+    "--json", "-q", "--quiet", "--log-file", "WORKSPACE",
+}  # fmt: skip
 _TIGHT_BAR = r'<mo stretchy="false" lspace="0" rspace="0">\1</mo>'
 
 
@@ -38,16 +46,147 @@ def on_page_content(content: str, *, page: Page, config: MkDocsConfig, files: Fi
 
 
 def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Put the tables of stages, export formats and rasters where a page asks for them."""
-    if _STAGES in markdown:
-        from alice_survey.app import stages
+    """Put tables of what the code knows where a page asks for them."""
+    return _TABLE.sub(lambda found: made_table(found[1], page.file.src_uri), markdown)
 
-        markdown = markdown.replace(_STAGES, stages.table())
-    if _FORMATS in markdown:
-        markdown = markdown.replace(_FORMATS, formats_table())
-    if _RASTERS in markdown:
-        markdown = markdown.replace(_RASTERS, rasters_table())
-    return markdown
+
+def made_table(name: str, where: str) -> str:
+    """One of these tables in Markdown.
+
+    Raises:
+        PluginError: There is none of this name.
+    """
+    from alice_survey.app import stages
+
+    tables = {
+        "stages": stages.table,
+        "export formats": formats_table,
+        "rasters": rasters_table,
+        "commands": commands_table,
+        "settings": settings_tables,
+    }
+    if name.startswith("commands of "):
+        return command_sections(name.removeprefix("commands of "))
+    if name not in tables:
+        raise PluginError(f"{where}: there is no table of {name}")
+    return tables[name]()
+
+
+def commands_table() -> str:
+    """All commands by the headings of the first help, and the options that many have."""
+    from alice_survey.app.cli.main import GROUPS
+
+    lines: list[str] = []
+    for heading, names in GROUPS.items():
+        lines += [f"## {heading}", "| command | what it does |", "|---|---|"]
+        for name, command in _found(names):
+            link = f"[`{name}`]({heading.lower()}.md#alice-survey-{name.replace(' ', '-')})"
+            lines.append(f"| {link} | {_plain(command.help.splitlines()[0])} |")
+        lines.append("")
+    shared: dict[str, str] = {}
+    for _, command in _found(" ".join(GROUPS.values())):
+        for option in command.params:
+            if _name(option) in _SHARED:
+                shared.setdefault(_name(option), _option_row(option))
+    return "\n".join([*lines, "## Options of many commands", *_OPTION_HEAD, *shared.values()])
+
+
+def command_sections(heading: str) -> str:
+    """The commands below a heading of the first help, each with its help, examples and options."""
+    from alice_survey.app.cli.main import GROUPS
+
+    lines: list[str] = []
+    for name, command in _found(GROUPS[heading]):
+        examples = command.epilog.split("Examples:\n")[-1]
+        lines += [f"## `alice-survey {name}`", _plain(command.help.replace("\b\n", "")), ""]
+        lines += ["```text", *(line.strip() for line in examples.strip().splitlines()), "```", ""]
+        own = [one for one in command.params if _name(one) not in _SHARED]
+        if own:
+            lines += [*_OPTION_HEAD, *map(_option_row, own), ""]
+        if shared := [f"`{_name(one)}`" for one in command.params if _name(one) in _SHARED]:
+            lines += [f"Also {', '.join(shared)} ([options of many commands](index.md)).", ""]
+    return "\n".join(lines)
+
+
+def _found(names: str) -> Iterator[tuple[str, Any]]:
+    """Commands of these names that do something, and those below them."""
+    import typer
+
+    from alice_survey.app.cli.main import app
+
+    commands: Any = typer.main.get_command(app)
+    for name in names.split():
+        command = commands.commands[name]
+        inner = getattr(command, "commands", {})
+        if not inner or command.invoke_without_command:
+            yield name, command
+        yield from ((f"{name} {k}", one) for k, one in inner.items() if not one.hidden)
+
+
+def _name(option: Any) -> str:
+    """An option's long name, an argument's own."""
+    return str(option.opts[0] if option.param_type_name == "option" else option.metavar)
+
+
+def _option_row(option: Any) -> str:
+    is_option = option.param_type_name == "option"
+    names = ", ".join(f"`{one}`" for one in [*option.opts, *option.secondary_opts])
+    is_set = option.default not in (None, False, ()) and not callable(option.default)
+    shown = {True: f"`{option.default}`", False: ""}[is_set]
+    metavar = f"`{option.metavar}`" if option.metavar else ""
+    kind = str(getattr(getattr(option, "type_descriptor", None), "annotation", ""))
+    if not metavar and "Literal" in kind:
+        metavar = _choices(kind)
+    cells = [names if is_option else metavar, metavar if is_option else "", shown]
+    return f"| {' | '.join(cells)} | {_plain(option.help or '')} |"
+
+
+def _choices(literal: str) -> str:
+    return ", ".join(f"`{choice}`" for choice in re.findall(r"'([^']+)'", literal))
+
+
+def _plain(text: str) -> str:
+    """Words of the command line, safe in a table of Markdown."""
+    return re.sub(r"([|*_<\[\]`])", r"\\\1", text)
+
+
+def settings_tables() -> str:
+    """All settings of `survey.toml`, section by section."""
+    from alice_survey.core.config import Config, SurveyConfig
+
+    sections = {
+        name: field.annotation
+        for name, field in SurveyConfig.model_fields.items()
+        if isinstance(field.annotation, type) and issubclass(field.annotation, Config)
+    }
+    lines = ["## At the top", *_SETTING_HEAD]
+    lines += [
+        _setting_row(name, field)
+        for name, field in SurveyConfig.model_fields.items()
+        if name not in sections
+    ]
+    for name, model in sections.items():
+        about = (inspect.getdoc(model) or "").splitlines()[0]
+        lines += ["", f"## `[{name}]`", _plain(about), "", *_SETTING_HEAD]
+        lines += [_setting_row(key, field) for key, field in model.model_fields.items()]
+    return "\n".join(lines)
+
+
+def _setting_row(name: str, field: Any) -> str:
+    """A setting: its default or an example, its range or choices, what it is."""
+    extra = field.json_schema_extra or {}
+    default = field.get_default(call_default_factory=True)
+    if isinstance(default, tuple | str | bool | int | float):
+        shown = f"`{json.dumps(default)}`"
+    else:
+        shown = f"none, or such as `{extra['example']}`" if extra.get("example") else "none"
+    if "Literal" in str(field.annotation):
+        limits = _choices(str(field.annotation))
+    else:
+        signs = (("ge", ">="), ("gt", ">"), ("le", "<="), ("lt", "<"))
+        bounds = [(sign, getattr(one, key, None)) for one in field.metadata for key, sign in signs]
+        limits = ", ".join(f"{sign} {value:.10g}" for sign, value in bounds if value is not None)
+    return f"| `{name}` | {shown} | {limits} | {_plain(field.description or '')} |"
 
 
 def formats_table() -> str:

@@ -13,6 +13,7 @@ import pytest
 import yaml
 
 import alice_survey as alice
+from tests import structure
 from tests.alice_survey.kit.browser import Heard, chromium
 from tests.docs.pages import DOCS, pages
 
@@ -65,6 +66,18 @@ def test_the_api_pages_show_each_public_name_with_all_its_fields(site: Path) -> 
         "ports.flat.FlatPort.port_distance_m", "ports.dome.DomePort.dome_x_m",
     ):  # fmt: skip
         assert f'id="camera_calib.{field}"' in page, field
+
+
+def test_the_reference_has_every_command_option_and_setting(site: Path) -> None:
+    pages = [site / "settings.html", *(site / "commands").glob("*.html")]
+    reference = "".join(path.read_text(encoding="utf-8") for path in pages)
+    for name, command in structure.commands().items():
+        assert f'id="alice-survey-{name.replace(" ", "-")}"' in reference, name
+        for option in command.params:
+            assert f"<code>{option.opts[0]}</code>" in reference or option.opts[0][0] != "-"
+    for section, field in alice.SurveyConfig.model_fields.items():
+        for key in getattr(field.annotation, "model_fields", {section: field}):
+            assert f"<code>{key}</code>" in reference, f"{section}.{key}"
 
 
 def test_modules_that_the_theory_names_exist() -> None:
