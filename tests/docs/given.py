@@ -201,6 +201,7 @@ GIVEN: dict[str, Callable[[Path, Made], None]] = {
     "how-to/big-survey.md": _big_survey,
     "how-to/cluster.md": _reef,
     "how-to/colour-camera.md": _colour_camera,
+    "how-to/measure.md": _reef,
     "how-to/no-navigation.md": _stereo,
     "how-to/other-programs.md": _reef,
     "how-to/own-camera.md": _own_camera,

@@ -45,7 +45,9 @@ def main() -> None:
         made = Path(sys.argv[1]) if sys.argv[1:] else Made(scratch).after(TUTORIAL)
         copy = Path(shutil.copytree(made / "reef", scratch / "copy" / "reef"))
         for file, (width, paths) in SHEETS.items():
-            side_by_side([copy / path for path in paths], width).save(DOCS / "tutorial" / file)
+            sheet = side_by_side([copy / path for path in paths], width)
+            few = sheet.quantize(96) if file.endswith(".png") else sheet  # colours: small files
+            few.save(DOCS / "tutorial" / file, optimize=True)
         with begun_page({"width": 1100, "height": 900}) as (page, _):
             page.goto((copy / "report" / "report.html").as_uri())
             photograph(page, DOCS / "tutorial" / "report.jpg", 1500)

@@ -130,6 +130,10 @@ def test_pages_open_from_disk_and_ask_for_nothing_else(site: Path, browser: Any)
     for page in held:
         tab.goto(page.as_uri())
         assert tab.evaluate("document.documentElement.scrollWidth") <= 400, page
+        assert page.stat().st_size <= 300_000, page
+        is_made = page.parent.name in ("api", "commands") or page.stem == "settings"
+        height = tab.evaluate("document.documentElement.scrollHeight")
+        assert is_made or height <= 8_000, page
     tab.close()
     assert heard.complaints == []
     assert [asked for asked in heard.requests if not asked.startswith(("file:", "data:"))] == []
