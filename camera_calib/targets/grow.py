@@ -56,19 +56,23 @@ _STIFFNESS = 0.1
 """Weight of 'no change of slope', nor of bends, against that of a neighbour one square away."""
 
 
-def grown_chessboard(picture: NDArray[np.uint8], shape: tuple[int, int]) -> Array | None:
+def grown_chessboard(
+    picture: NDArray[np.uint8], shape: tuple[int, int], near: Array | None = None
+) -> Array | None:
     """Find a chessboard of which corners may be hidden.
 
     Args:
         picture: (H, W) grey values of 8 bits.
         shape: rows and columns of inner corners.
+        near: (rows, columns, 2) pixels of corners that a detector found: perhaps a part of a larger
+            board, or places beyond its end; None to search.
 
     Returns:
         (rows * columns, 2) pixels from the outer corner of the first pixel, in any numbering; NaN
         rows were not found. None when the board was not found.
     """
     taken = np.empty((0, 2))
-    for start in _starts(picture):
+    for start in _starts(picture) if near is None else [_places(near)]:
         apart = np.linalg.norm(taken[:, None] - np.array(list(start.values())), axis=-1)
         if np.any(apart < _APART_PX):
             continue
@@ -88,6 +92,11 @@ def spans_board(seen: NDArray[np.bool_]) -> bool:
     sides = (seen[0], seen[-1], seen[:, 0], seen[:, -1])
     outer = min(float(side.mean()) for side in sides)
     return bool(seen.mean() >= _MIN_SHARE and outer >= _MIN_OUTER_SHARE)
+
+
+def _places(grid: Array) -> Places:
+    """The inverse of `_spread`, of corners that are all known."""
+    return {(x, y): grid[y, x] for y, x in np.ndindex(grid.shape[:2])}
 
 
 def _spread(known: Places) -> Array:
@@ -157,16 +166,23 @@ def _saddles(picture: NDArray[np.uint8]) -> tuple[Array, Array, Array]:
 
 
 def _grow(picture: NDArray[np.uint8], start: Places, longest: int) -> Places:
-    """Add corners that fit next to the known ones, until none does or the board gets too large."""
-    places = np.array(list(start))
-    pixels = np.array(list(start.values()))
-    steps = from_neighbours(places.astype(np.float64), pixels, places.astype(np.float64))[1]
+    """Add corners that fit next to the known ones, until none does or the board gets too large.
+
+    The start is four corners, or more of which some may be wrong.
+    """
+    places, pixels = np.array(list(start)), np.array(list(start.values()))
+    board = places.astype(np.float64)
+    expected, steps = from_neighbours(board, pixels, board, others=True)
     fits = fit_corners(picture, pixels, steps)
     contrast = _alternating(places) * fits.contrast
-    middle = float(np.median(contrast))
-    if not np.isfinite(middle) or (contrast / middle < _WEAKEST).any():
+    seen = np.isfinite(contrast)
+    if seen.sum() < 4:
         return {}
-    known: Places = dict(zip(start, np.column_stack([fits.pixels, contrast]), strict=True))
+    good = seen & (contrast / np.median(contrast[seen]) > _WEAKEST)
+    good &= off_squares(fits.pixels, expected, steps) < _OFF
+    known = _knit(_fitted(places[good], fits.pixels[good], contrast[good]), (-1, 1))
+    if len(known) < 4:
+        return {}
     tries: Counter[Place] = Counter()
     for _ in range(_MAX_ROUNDS):
         fresh = _next_to(picture, known, tries)
@@ -179,12 +195,16 @@ def _grow(picture: NDArray[np.uint8], start: Places, longest: int) -> Places:
     return known
 
 
-def _knit(known: Places) -> Places:
+def _fitted(places: NDArray[np.int_], pixels: Array, contrast: Array) -> Places:
+    keys = [(int(x), int(y)) for x, y in places]
+    return dict(zip(keys, np.column_stack([pixels, contrast]), strict=True))
+
+
+def _knit(known: Places, near: tuple[int, ...] = (-2, -1, 1, 2)) -> Places:
     """Only corners with known ones along both ways: one that fits by chance off the board has none.
 
     A known corner may lie one further, for a shadow's edge or a glare hides whole rows.
     """
-    near = (-2, -1, 1, 2)
     while True:
         kept = {
             (x, y): corner
@@ -223,12 +243,15 @@ def _next_to(picture: NDArray[np.uint8], known: Places, tries: Counter[Place]) -
     nearest = cKDTree(board).query(tried, k=min(_ALIKE_NEAR, len(board)))[1]
     contrast = _alternating(tried) * fits.contrast
     good = contrast / np.median(corners[nearest, 2], axis=1) > _WEAKEST
-    miss = (fits.pixels[good] - expected[good])[..., None]
-    off = np.linalg.norm(np.linalg.solve(steps[good], miss)[..., 0], axis=1)
-    good[good] = off < _OFF
-    keys = [(int(x), int(y)) for x, y in tried[good]]
-    found = np.column_stack([fits.pixels[good], contrast[good]])
-    return dict(zip(keys, found, strict=True))
+    good &= off_squares(fits.pixels, expected, steps) < _OFF
+    return _fitted(tried[good], fits.pixels[good], contrast[good])
+
+
+def off_squares(pixels: Array, expected: Array, steps: Array) -> Array:
+    """(K,) distances of pixels (K, 2) from where they are expected, in squares."""
+    return np.asarray(
+        np.linalg.norm(np.linalg.solve(steps, (pixels - expected)[..., None])[..., 0], axis=1)
+    )
 
 
 def from_neighbours(

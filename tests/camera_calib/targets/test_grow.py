@@ -5,12 +5,13 @@ import numpy as np
 import pytest
 
 from camera_calib.targets.detect import chessboard_size
-from camera_calib.targets.grow import grown_chessboard, spans_board
+from camera_calib.targets.grow import from_neighbours, grown_chessboard, spans_board
 from camera_calib.targets.target import parse_target
 from tests.oracles_targets import picture_light, seen_from, to_srgb, true_pixels
 
 SIZE = (640, 480)
 BOARD = parse_target("chessboard 9x6 25mm")
+GRID = BOARD.points[:, :2] / BOARD.size_m
 
 
 def view(turn: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray]:
@@ -39,6 +40,19 @@ def test_whole_boards_are_found(turn: tuple[float, float, float]) -> None:
     assert chessboard_size(picture) == (9, 6)
     assert grown_chessboard(picture, (6, 8)) is None
     assert grown_chessboard(picture, (7, 9)) is None
+
+
+@pytest.mark.parametrize("shift", [-1, 1])
+def test_a_detector_that_goes_beyond_a_board_is_corrected(shift: int) -> None:
+    """A column beyond its end, in place of the one at its other end."""
+    picture, true = view((30, 25, 20))
+    near = from_neighbours(GRID, true, GRID + np.array([shift, 0.0]))[0].reshape(6, 9, 2)
+    found = grown_chessboard(picture, (6, 9), near)
+    assert found is not None
+    assert len(matched(found, true, 0.1)) == 54
+    assert grown_chessboard(picture, (6, 8), near[:, :8]) is None
+    sparse = true.reshape(6, 9, 2)[::2, ::2]
+    assert grown_chessboard(picture, (3, 5), sparse) is None
 
 
 def found_in(light: np.ndarray, true: np.ndarray, off_px: float) -> int:
