@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr
+from scipy.special import ndtr, stdtr
 
 from alice_survey.core.frames import Array
 from alice_survey.core.run import progress
@@ -23,11 +23,8 @@ DESIGN_RANGE_M = 2.0
 """Usual working range; used if the views are close to it."""
 _MAP_COLUMNS, _MAP_ROWS = 25, 21
 
-_ODD_PICTURE = 2.0
 _MAX_OUTLIERS = 0.01
 """Share of the points."""
-_HELD_OUT_LIMITS = 1.2, 2.0
-"""Ratios above which a verdict is `look` and `bad`, here as in all pairs of limits."""
 _P_LOOK, _P_BAD = 1e-3, 1e-6
 """Levels of all tests: of an exact calibration, one verdict in a thousand is `look`."""
 _NEAREST_GLASS_M, _MAX_GLASS_M = 0.002, 0.25
@@ -42,8 +39,8 @@ target, above which it should be better, and of the model, below which none is `
 _SIGMAS = 3.0
 _SHOWN = 1e-4
 """Least variance of a parameter's change by the views, over its prior's; less is rounding."""
-_SIGMA_LIMITS = 3.0, 10.0
-"""Projection sigma that nine tenths of the frame keep below, over the noise."""
+_MAX_SIGMA = 10.0
+"""Projection sigma over the noise, in nine tenths of where the target was seen: never `bad`."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -197,13 +194,18 @@ def _outlier_verdicts(outliers: int, points: int, which: str) -> Iterator[Verdic
 
 def _fit_verdicts(judged: Judgement) -> Iterator[Verdict]:
     """Pictures that fit badly, outliers, and what homographies leave at the edges."""
-    median = float(np.median([p.rms_px for p in judged.pictures]))
-    odd = [p for p in judged.pictures if p.rms_px > _ODD_PICTURE * median]
-    score = judged.hold_out
-    harmless = score is not None and score.rms_px <= _HELD_OUT_LIMITS[0] * score.expected_px
+    rms_px = np.array([p.rms_px for p in judged.pictures]) + 1e-12
+    median = float(np.median(rms_px))
+    over = 2.0 * np.log(rms_px / median)
+    chance = [(2.0 / max(2 * p.points - 6, 2)) ** 0.5 for p in judged.pictures]
+    scatter = np.maximum(chance, np.quantile(np.abs(over), 0.683))
+    tails = len(over) * ndtr(-over / scatter)
+    odd = [judged.pictures[i] for i in np.flatnonzero(tails < _P_LOOK)]
+    harmless = judged.hold_out is not None and judged.hold_out.p_value >= _P_LOOK
     listed = ", ".join(f"view {p.view} of {p.camera} ({p.rms_px:.3f} px)" for p in odd[:5])
-    pictures = count(len(odd), "picture")
-    text = f"{pictures} over {_ODD_PICTURE:g} times the median of {median:.3f} px rms"
+    text = (
+        f"{count(len(odd), 'picture')} above the median of {median:.3f} px rms at p < {_P_LOOK:g}"
+    )
     if odd and not harmless:
         yield _look(f"{text}, such as {listed}; look at them for blur, motion or a bent target")
     else:
@@ -288,12 +290,13 @@ def _hold_out_verdicts(judged: Judgement) -> Iterator[Verdict]:
         yield _look("no views were held out: the fit is not tested")
         return
     ratio = score.rms_px / score.expected_px
-    yield _grade(
-        ratio, _HELD_OUT_LIMITS,
+    yield _test(
+        score.p_value,
         f"{score.views} held-out views fit to {score.rms_px:.3f} px rms, {ratio:.2f} times what "
         f"noise and covariance predict ({score.expected_px:.3f} px); used views to "
         f"{score.used_rms_px:.3f} px",
-    )  # fmt: skip
+        ": too few views, or the camera changed between them",
+    )
     yield from _outlier_verdicts(score.outliers, score.points + score.outliers, "held-out points")
     if halves is not None:
         yield _test(
@@ -344,29 +347,32 @@ def _length_verdicts(judged: Judgement) -> Iterator[Verdict]:
         if lengths is None or not np.isfinite(scale):
             continue
         found, expected = lengths.rms_m()
-        off = abs(scale) > _SIGMAS * sigma or found > _HELD_OUT_LIMITS[0] ** 2 * expected
-        yield Verdict(
-            level="look" if off else "good",
-            text=f"long lengths on {which} views: scale error {scale:+.0f} +/- {sigma:.0f} ppm, "
+        yield _test(  # Student's: the sigma is from the scatter of few views
+            2.0 * float(stdtr(len(np.unique(lengths.view)) - 1, -abs(scale) / sigma)),
+            f"long lengths on {which} views: scale error {scale:+.0f} +/- {sigma:.0f} ppm, "
             f"{1e3 * found:.2f} mm rms ({1e3 * expected:.2f} mm by the noise alone)",
+            "; is the size of the target's squares right?",
         )
 
 
 def _uncertainty_verdicts(judged: Judgement) -> Iterator[Verdict]:
     noise_px, range_m = judged.calibration.noise_px, judged.working_range_m
     for name, camera in judged.cameras.items():
-        median, high, worst = np.nanquantile(camera.sigma.compensated_px, [0.5, 0.9, 1.0]).tolist()
+        sigma_px, count = camera.sigma.compensated_px, camera.coverage
+        cells = np.indices(sigma_px.shape).T * count.shape // sigma_px.shape
+        seen_px = sigma_px[count[tuple(cells.T)] > 0]  # elsewhere a warning says that none was
+        median, high, worst = np.nanquantile(seen_px, [0.5, 0.9, 1.0]).tolist()
         yield _grade(
-            high / noise_px, _SIGMA_LIMITS,
+            high / noise_px, (_MAX_SIGMA, np.inf),
             f"{name}: at {range_m:.3g} m the calibration lets a projection err by {median:.3f} "
-            f"px (median of the frame), {high:.3f} px (nine tenths of it stay below) to "
-            f"{worst:.3f} px (worst), best pose taken",
-            "; more views towards the edges bring it down",
+            f"px (median of where targets were), {high:.3f} px (nine tenths of it stay below) "
+            f"to {worst:.3f} px (worst), best pose taken",
+            "; more views at other angles and distances bring it down",
         )  # fmt: skip
     at_work = judged.stereo
     if at_work is not None and np.isfinite(at_work.length_sigma_m):
-        yield Verdict(
-            level="good" if at_work.length_sigma_m < 1e-3 * at_work.length_m else "look",
-            text=f"stereo at {range_m:.3g} m: a length of {at_work.length_m:.2f} m errs by "
+        yield _grade(
+            at_work.length_sigma_m / at_work.length_m, (1e-3, np.inf),
+            f"stereo at {range_m:.3g} m: a length of {at_work.length_m:.2f} m errs by "
             f"{1e3 * at_work.length_sigma_m:.3f} mm from the calibration alone",
-        )
+        )  # fmt: skip

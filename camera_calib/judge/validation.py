@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import RigidTransform
-from scipy.special import chdtrc
+from scipy.special import chdtrc, stdtr
 
 from alice_survey.core.errors import CalibrationError, warn
 from alice_survey.core.frames import Array
@@ -111,6 +111,8 @@ class HoldOutScore:
     """Rms expected from noise and the rig's covariance, as far as a pose cannot absorb it."""
     used_rms_px: float
     outliers: int
+    p_value: float
+    """Probability of as large residuals by chance, as it scatters between the views."""
 
 
 def score_hold_out(held: HeldOut) -> HoldOutScore:
@@ -122,7 +124,7 @@ def score_hold_out(held: HeldOut) -> HoldOutScore:
     rig, noise_px = held.used.rig, held.used.noise_px
     matrix = covariance_of(rig).matrix
     kept = within_gate(held.residuals_px, noise_px)
-    expected = 0.0
+    expected = np.zeros(len(held.views))
     for v in range(len(held.views)):
         points_rig = held.rig_from_target[v].apply(held.used.target_points)
         by_pose, by_parameter = [], []
@@ -131,20 +133,39 @@ def score_hold_out(held: HeldOut) -> HoldOutScore:
             by_pose.append(pose_jacobian(by_point, points_rig[kept[v, c]]).reshape(-1, 6))
             by_parameter.append(slopes.reshape(-1, slopes.shape[-1]))
         g, j = np.concatenate(by_pose), np.concatenate(by_parameter)
-        if len(g) < 6:
+        if len(g) <= 6:
             continue
         left = j - g @ taken_up(g, j)
-        expected += noise_px**2 * max(len(g) - 6, 0)
-        expected += float(np.einsum("np,pq,nq->", left, matrix, left))
-    points = int(kept.sum())
+        expected[v] = noise_px**2 * (len(g) - 6)
+        expected[v] += float(np.einsum("np,pq,nq->", left, matrix, left))
+    points, total = int(kept.sum()), float(expected.sum())
+    fitting = within_gate(held.used.residuals_px, noise_px)
+    found, used = (
+        (one**2).sum(axis=(1, 2, 3), where=stay[..., None])
+        for one, stay in ((held.residuals_px, kept), (held.used.residuals_px, fitting))
+    )
+    usual = noise_px**2 * np.maximum(2.0 * fitting.sum(axis=(1, 2)) - 6.0, 1.0)
     return HoldOutScore(
         views=len(held.views),
         points=points,
         rms_px=rms_length_px(held.residuals_px, noise_px),
-        expected_px=float(np.sqrt(expected / points)) if points else float("nan"),
+        expected_px=float(np.sqrt(total / points)) if points else float("nan"),
         used_rms_px=rms_length_px(held.used.residuals_px, held.used.sigma_px[..., None]),
         outliers=int(np.isfinite(held.residuals_px[..., 0]).sum()) - points,
+        p_value=_p_larger(found, expected, used, usual),
     )
+
+
+def _p_larger(found: Array, expected: Array, used: Array, usual: Array) -> float:
+    """Student's test of whether views have larger squares than expected, by all views' scatter."""
+    known = expected > 0.0
+    if not known.any():
+        return 0.0
+    held, rest = np.log(found[known] / expected[known]), np.log(used / usual)
+    freedom = len(held) + len(rest) - 2
+    squares = (held.var() * len(held) + rest.var() * len(rest)) / freedom
+    sigma = np.sqrt(squares * (1.0 / len(held) + 1.0 / len(rest)))
+    return float(stdtr(freedom, -held.mean() / sigma))
 
 
 @dataclass(frozen=True, kw_only=True)

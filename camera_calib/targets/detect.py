@@ -18,13 +18,7 @@ from scipy.spatial import cKDTree
 from alice_survey.core.errors import CalibrationError
 from alice_survey.core.frames import Array
 from camera_calib.targets.corners import ASTRAY, FITTED, REASONS, Corners, Grey, fit_corners
-from camera_calib.targets.grow import (
-    board_map,
-    from_neighbours,
-    grown_chessboard,
-    off_squares,
-    spans_board,
-)
+from camera_calib.targets.grow import board_map, from_neighbours, grown_chessboard, spans_board
 from camera_calib.targets.pattern import surroundings
 from camera_calib.targets.target import (
     TAG_BITS,
@@ -267,7 +261,7 @@ def _without_astray(target: Target, corners: Corners) -> Corners:
         return corners
     board, pixels = target.points[fitted, :2] / target.size_m, corners.pixels[fitted]
     expected, steps = from_neighbours(board, pixels, board, others=True)
-    off = off_squares(pixels, expected, steps)
+    off = np.linalg.norm(np.linalg.solve(steps, (pixels - expected)[..., None])[..., 0], axis=1)
     contrast = np.where(target.top_left_black[fitted], 1.0, -1.0) * corners.contrast[fitted]
     if target.is_ambiguous:  # of such chessboards the first square may be white
         contrast *= np.sign(np.median(contrast))
@@ -368,35 +362,25 @@ def find_chessboard_near(target: Target, grey: Grey) -> Array | None:
 
 
 def _chessboard_tries(target: Target, grey: Grey) -> Iterator[Array | None]:
-    """Detectors, the fast one first, then more thorough ones.
-
-    OpenCV's may find a part of a larger board, or corners beyond a board's end in place of some of
-    its own: the board is grown again from what they find.
-    """
+    """Boards grown from what detectors find, the fast one first, then more thorough ones."""
     size = (target.columns, target.rows)
     small, large = reduce_picture(grey, SMALL_PX), reduce_picture(grey, LARGE_PX)
 
-    def grown(part: Reduced, found: tuple[bool, Any] | None = None) -> Array | None:
-        near = None
-        if found is not None:
-            if not found[0]:
-                return None
-            near = (part.whole(found[1]) / large.scale).reshape(*target.shape, 2)
-            part = large
-        board = grown_chessboard(part.picture, target.shape, near)
+    def grow(part: Reduced, found: bool = True, corners: Any = None) -> Array | None:
+        near = None if corners is None else np.float64(corners).reshape(*target.shape, 2) + 0.5
+        board = grown_chessboard(part.picture, target.shape, near) if found else None
         return None if board is None else board * part.scale
 
-    yield grown(small, cv2.findChessboardCornersSB(small.picture, size, flags=0))
+    yield grow(small, *cv2.findChessboardCornersSB(small.picture, size, flags=0))
     for part in (small, large) if large.picture.size > small.picture.size else (small,):
-        yield grown(part)
-    thorough = cv2.CALIB_CB_EXHAUSTIVE
-    yield grown(large, cv2.findChessboardCornersSB(large.picture, size, flags=thorough))
+        yield grow(part)
+    yield grow(large, *cv2.findChessboardCornersSB(large.picture, size, cv2.CALIB_CB_EXHAUSTIVE))
     # The classic detector takes minutes on large pictures that hold no board.
     classic = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
-    yield grown(small, cv2.findChessboardCorners(small.picture, size, flags=classic))
+    yield grow(small, *cv2.findChessboardCorners(small.picture, size, flags=classic))
     if max(grey.shape) > 1.2 * LARGE_PX:
         whole = reduce_picture(grey, max(grey.shape))
-        yield grown(whole, cv2.findChessboardCornersSB(whole.picture, size, flags=0))
+        yield grow(whole, *cv2.findChessboardCornersSB(whole.picture, size, flags=0))
 
 
 def find_markers_near(target: Target, grey: Grey) -> tuple[Array | None, str]:

@@ -64,15 +64,15 @@ def grown_chessboard(
     Args:
         picture: (H, W) grey values of 8 bits.
         shape: rows and columns of inner corners.
-        near: (rows, columns, 2) pixels of corners that a detector found: perhaps a part of a larger
-            board, or places beyond its end; None to search.
+        near: (rows, columns, 2) pixels to grow from, of which some may be wrong; None to search.
 
     Returns:
         (rows * columns, 2) pixels from the outer corner of the first pixel, in any numbering; NaN
         rows were not found. None when the board was not found.
     """
     taken = np.empty((0, 2))
-    for start in _starts(picture) if near is None else [_places(near)]:
+    given = {} if near is None else {(x, y): near[y, x] for y, x in np.ndindex(near.shape[:2])}
+    for start in _starts(picture) if near is None else [given]:
         apart = np.linalg.norm(taken[:, None] - np.array(list(start.values())), axis=-1)
         if np.any(apart < _APART_PX):
             continue
@@ -92,11 +92,6 @@ def spans_board(seen: NDArray[np.bool_]) -> bool:
     sides = (seen[0], seen[-1], seen[:, 0], seen[:, -1])
     outer = min(float(side.mean()) for side in sides)
     return bool(seen.mean() >= _MIN_SHARE and outer >= _MIN_OUTER_SHARE)
-
-
-def _places(grid: Array) -> Places:
-    """The inverse of `_spread`, of corners that are all known."""
-    return {(x, y): grid[y, x] for y, x in np.ndindex(grid.shape[:2])}
 
 
 def _spread(known: Places) -> Array:
@@ -166,22 +161,14 @@ def _saddles(picture: NDArray[np.uint8]) -> tuple[Array, Array, Array]:
 
 
 def _grow(picture: NDArray[np.uint8], start: Places, longest: int) -> Places:
-    """Add corners that fit next to the known ones, until none does or the board gets too large.
-
-    The start is four corners, or more of which some may be wrong.
-    """
-    places, pixels = np.array(list(start)), np.array(list(start.values()))
-    board = places.astype(np.float64)
+    """Add corners to some, of which a few may be wrong, until none fits or there are too many."""
+    board, pixels = np.array(list(start), dtype=np.float64), np.array(list(start.values()))
     expected, steps = from_neighbours(board, pixels, board, others=True)
     fits = fit_corners(picture, pixels, steps)
-    contrast = _alternating(places) * fits.contrast
-    seen = np.isfinite(contrast)
-    if seen.sum() < 4:
-        return {}
-    good = seen & (contrast / np.median(contrast[seen]) > _WEAKEST)
-    good &= off_squares(fits.pixels, expected, steps) < _OFF
-    known = _knit(_fitted(places[good], fits.pixels[good], contrast[good]), (-1, 1))
-    if len(known) < 4:
+    contrast = _alternating(board) * fits.contrast
+    found = np.column_stack([fits.pixels, contrast])
+    known = _knit(_near(board, found, (expected, steps), np.nansum(contrast) / len(board)), (-1, 1))
+    if not known:
         return {}
     tries: Counter[Place] = Counter()
     for _ in range(_MAX_ROUNDS):
@@ -193,11 +180,6 @@ def _grow(picture: NDArray[np.uint8], start: Places, longest: int) -> Places:
         if (np.ptp(np.array(list(known)), axis=0) >= longest).any():
             break
     return known
-
-
-def _fitted(places: NDArray[np.int_], pixels: Array, contrast: Array) -> Places:
-    keys = [(int(x), int(y)) for x, y in places]
-    return dict(zip(keys, np.column_stack([pixels, contrast]), strict=True))
 
 
 def _knit(known: Places, near: tuple[int, ...] = (-2, -1, 1, 2)) -> Places:
@@ -216,7 +198,7 @@ def _knit(known: Places, near: tuple[int, ...] = (-2, -1, 1, 2)) -> Places:
         known = kept
 
 
-def _alternating(places: NDArray[np.int_]) -> Array:
+def _alternating(places: Array) -> Array:
     """1 and -1 in turn, as the colours of a chessboard's corners."""
     return np.asarray(1.0 - 2.0 * (places.sum(axis=1) % 2))
 
@@ -235,23 +217,24 @@ def _next_to(picture: NDArray[np.uint8], known: Places, tries: Counter[Place]) -
     if not worth:
         return {}
     tries.update(worth)
-    tried = np.array(worth)
+    tried = np.array(worth, dtype=np.float64)
     board, corners = np.array(list(known), dtype=np.float64), np.array(list(known.values()))
     pixels = np.ascontiguousarray(corners[:, :2])
-    expected, steps = from_neighbours(board, pixels, tried.astype(np.float64))
+    expected, steps = from_neighbours(board, pixels, tried)
     fits = fit_corners(picture, expected, steps)
     nearest = cKDTree(board).query(tried, k=min(_ALIKE_NEAR, len(board)))[1]
     contrast = _alternating(tried) * fits.contrast
-    good = contrast / np.median(corners[nearest, 2], axis=1) > _WEAKEST
-    good &= off_squares(fits.pixels, expected, steps) < _OFF
-    return _fitted(tried[good], fits.pixels[good], contrast[good])
+    found = np.column_stack([fits.pixels, contrast])
+    return _near(tried, found, (expected, steps), np.median(corners[nearest, 2], axis=1))
 
 
-def off_squares(pixels: Array, expected: Array, steps: Array) -> Array:
-    """(K,) distances of pixels (K, 2) from where they are expected, in squares."""
-    return np.asarray(
-        np.linalg.norm(np.linalg.solve(steps, (pixels - expected)[..., None])[..., 0], axis=1)
-    )
+def _near(places: Array, found: Array, at: tuple[Array, Array], usual: Array | float) -> Places:
+    """Corners that lie where the places and steps of `at` have them, with the usual contrast."""
+    off = np.linalg.norm(np.linalg.solve(at[1], (found[:, :2] - at[0])[..., None])[..., 0], axis=1)
+    good = (found[:, 2] / usual > _WEAKEST) & (off < _OFF)
+    return {
+        (int(x), int(y)): corner for (x, y), corner in zip(places[good], found[good], strict=True)
+    }
 
 
 def from_neighbours(

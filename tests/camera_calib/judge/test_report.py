@@ -131,12 +131,31 @@ def test_a_picture_that_does_no_harm_asks_for_nothing() -> None:
     first = judged.pictures[0]
     odd = replace(judged, pictures=(replace(first, rms_px=3 * first.rms_px), *judged.pictures[1:]))
     assert odd.hold_out is not None
-    bad = replace(odd.hold_out, rms_px=2 * odd.hold_out.expected_px)
+    bad = replace(odd.hold_out, p_value=1e-9)
     for judgement, level in (
         (odd, "good"), (replace(odd, hold_out=bad), "look"), (replace(odd, hold_out=None), "look"),
     ):  # fmt: skip
         about = [v for v in verdicts(judgement) if f"view {first.view} of" in v.text]
         assert [v.level for v in about] == [level]
+
+
+def test_held_out_views_that_err_twice_as_much_are_bad() -> None:
+    held = usual_held_out()
+    judged = judge(usual(), replace(held, residuals_px=2.0 * held.residuals_px))
+    assert [v.level for v in verdicts(judged) if "views fit to" in v.text] == ["bad"]
+
+
+def test_projections_count_where_the_target_was_seen() -> None:
+    judged = judge(usual(), None)
+    left = judged.cameras["left"]
+    half = left.coverage.copy()
+    half[:, half.shape[1] // 2 :] = 0
+    sigma_px = left.sigma.compensated_px.copy()
+    sigma_px[:, sigma_px.shape[1] // 2 + 1 :] *= 1e3
+    loose = replace(left, sigma=replace(left.sigma, compensated_px=sigma_px))
+    for camera, level in ((loose, "look"), (replace(loose, coverage=half), "good")):
+        found = verdicts(replace(judged, cameras={"left": camera}))
+        assert [v.level for v in found if "lets a projection" in v.text] == [level]
 
 
 def test_the_working_range_follows_the_views() -> None:
