@@ -367,8 +367,10 @@ def _chessboard_tries(target: Target, grey: Grey) -> Iterator[Array | None]:
     small, large = reduce_picture(grey, SMALL_PX), reduce_picture(grey, LARGE_PX)
 
     def grow(part: Reduced, found: bool = True, corners: Any = None) -> Array | None:
+        if not found:
+            return None
         near = None if corners is None else np.float64(corners).reshape(*target.shape, 2) + 0.5
-        board = grown_chessboard(part.picture, target.shape, near) if found else None
+        board = grown_chessboard(part.picture, target.shape, near)
         return None if board is None else board * part.scale
 
     yield grow(small, *cv2.findChessboardCornersSB(small.picture, size, flags=0))
