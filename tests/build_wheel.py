@@ -11,12 +11,12 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Mapping
 from importlib.metadata import distribution
 from pathlib import Path
 
 from alice_survey.core.compiled import PROCESSOR
-from tests.small_survey import SMALL
+from tests.small_survey import SMALL, settings_in
 from tests.structure import PACKAGES, ROOT
 
 SOURCES = (*PACKAGES, "LICENSE", "README.md", "pyproject.toml")
@@ -28,7 +28,7 @@ SURVEYS = {
 """Settings of those that are computed."""
 
 
-def build(out: Path, work: Path, surveys: Iterable[str] = SURVEYS) -> Path:
+def build(out: Path, work: Path, surveys: Mapping[str, str] = SURVEYS) -> Path:
     """The wheel, written into a folder; `work` is an empty one for all else."""
     source = work / "source"
     tracked = subprocess.check_output(["git", "ls-files", *SOURCES], cwd=ROOT, text=True)
@@ -41,10 +41,9 @@ def build(out: Path, work: Path, surveys: Iterable[str] = SURVEYS) -> Path:
         command = [sys.executable, "-m", *arguments]
         subprocess.run(command, env=os.environ | places, cwd=work, check=True)
 
-    for name in surveys:
-        (work / name).mkdir()
-        (work / name / "survey.toml").write_text(SURVEYS[name])
-        python("alice_survey", "run", "-w", name)
+    for name, text in surveys.items():
+        settings_in(work / name, text)
+        python("alice_survey", "run", "-w", name, "--threads", "1")
     for file in list(source.rglob("__pycache__/*.nb[ic]")):
         folder = file.parent.with_name("_kernels")
         folder.mkdir(exist_ok=True)

@@ -3,21 +3,24 @@
 import ast
 import json
 import os
+import pickle
 import signal
 import subprocess
 import sys
 import venv
 import zipfile
+from collections import defaultdict
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from alice_survey.core.compiled import TABLE
 from tests.alice_survey.app.studio.test_run import loaded
 from tests.build_wheel import build
 from tests.first_minutes import COMMANDS, INNER
-from tests.small_survey import settings_in
+from tests.small_survey import TINY, settings_in
 from tests.test_loop import results
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("wheel")]
@@ -36,11 +39,23 @@ EXTRAS: dict[str, str | tuple[str, ...]] = {
     ),
 }  # fmt: skip
 """Packages of extras, and the only places that may import them."""
+ALLOWED = {
+    # Views of larger arrays, or arrays that may not be written to, next to whole ones.
+    "correlated_fit.whiten.entry": 3,
+    "exact_observations._put.entry": 2,
+    "solve.bilinear.entry": 2,
+    "visibility.look_up": 2,
+    # Literals, places left out, and two widths of numbers.
+    "points._way": 2,
+    "range_shift.slopes_of": 2,
+    "surface_points.sorted_ranks": 2,
+}
+"""Most versions of kernels that may have more than one, by the reason."""
 
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return build(tmp_path_factory.mktemp("wheel"), tmp_path_factory.mktemp("work"), ["flat"])
+    return build(tmp_path_factory.mktemp("wheel"), tmp_path_factory.mktemp("work"), {"tiny": TINY})
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +65,7 @@ def program(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     venv.create(folder, with_pip=False, symlinks=True)
     subprocess.run(
         [sys.executable, "-m", "pip", f"--python={folder / 'bin' / 'python'}", "install",
-         "--quiet", "--disable-pip-version-check", str(wheel)],
+         "--quiet", "--disable-pip-version-check", "--no-compile", str(wheel)],
         check=True, cwd=folder, env=_environment(),
     )  # fmt: skip
     return folder / "bin" / "alice-survey"
@@ -80,6 +95,22 @@ def test_it_holds_what_the_packages_read(wheel: Path) -> None:
     only_to_build = (".json", ".mjs", ".d.ts", "entry_map.js", "entry_mesh.js", ".gitignore")
     needed = {name for name in tracked if not name.endswith(only_to_build)}
     assert needed <= held
+
+
+def test_the_kernels_of_a_survey_have_one_version_each(wheel: Path) -> None:
+    """Each combination of types of arguments is compiled for itself: literals and flags count."""
+    versions: defaultdict[str, set[object]] = defaultdict(set)
+    with zipfile.ZipFile(wheel) as archive:
+        for index in (name for name in archive.namelist() if name.endswith(".nbi")):
+            with archive.open(index) as file:
+                _, (_, kept) = pickle.load(file), pickle.load(file)  # noqa: S301  our own
+            versions[Path(index).name.rpartition("-")[0]].update(kept)
+    counts = {name: len(kinds) for name, kinds in versions.items()}
+    assert not {name: n for name, n in counts.items() if n > ALLOWED.get(name, 1)}
+    table = json.loads(TABLE.read_text())  # else: python -m tests.test_kernels
+    named = [name.split(".") for part in table.values() for name in part]
+    own = {".".join(x[-3 if x[-1] == "entry" else -2 :]) for x in named}
+    assert own == set(versions)
 
 
 def test_it_compiles_nothing_where_nobody_may_write_to_it(
