@@ -86,12 +86,6 @@ def test_every_stage_is_reported(small_survey: Path) -> None:
             assert event.get("done", 0) <= event.get("total", event.get("done", 0))
 
 
-KILLED = tuple(
-    stage for stage in FOLDERS for _ in range(2 if stage in {"mapping", "dense", "mesh"} else 1)
-)
-"""Stages to be killed in, in order; twice where they work longest."""
-
-
 def wait_for(
     run: subprocess.Popen[Any], events: Path, seen: int, max_s: float = math.inf, **facts: str
 ) -> dict[str, Any] | None:
@@ -110,32 +104,32 @@ def wait_for(
 
 
 def test_killed_again_and_again_it_ends_the_same(tiny_survey: Path, tmp_path: Path) -> None:
-    """At random times in every stage, once in most."""
+    """At a random time in every stage."""
     workspace = settings_in(tmp_path / "killed")
     events = workspace.with_suffix(".jsonl")
     took_s = {
         stage: json.loads((tiny_survey / stage / "stage.json").read_text())["took_s"]
         for stage in FOLDERS
     }
-    rng = np.random.default_rng(5)
+    rng, pace = np.random.default_rng(5), 1.0
     killed = dict.fromkeys(FOLDERS, 0)
     whole_before_kill = 0
-    while sum(killed.values()) < len(KILLED):
-        stage = KILLED[sum(killed.values())]
+    while sum(killed.values()) < len(FOLDERS):
+        stage = FOLDERS[sum(killed.values())]
         shutil.rmtree(workspace / stage, ignore_errors=True)  # it had ended before the last kill
         seen = events.stat().st_size if events.exists() else 0
         run = start(workspace, threads=1)
         assert wait_for(run, events, seen, event="stage_started", stage=stage), stage
-        moment_s = rng.uniform(0, took_s[stage])
+        moment_s = pace * rng.uniform(0, took_s[stage])
         ended = wait_for(run, events, seen, moment_s, event="stage_finished", stage=stage)
         if run.poll() is None:
             os.killpg(run.pid, signal.SIGKILL)
             killed[stage] += 1
             whole_before_kill += (workspace / stage).exists()
         run.wait()
-        if ended and not ended.get("resumed"):  # where kernels had to be compiled it took longer
-            took_s[stage] = min(took_s[stage], ended["took_s"])
-    assert whole_before_kill < len(KILLED) - 4  # at least five fell into the work of their stage
+        if ended and not ended.get("resumed"):  # on a busy machine it took longer, or with kernels
+            pace = min(pace, ended["took_s"] / took_s[stage])
+    assert whole_before_kill < len(FOLDERS) - 4  # at least five fell into the work of their stage
     assert start(workspace, threads=1).wait() == 0
     assert not list(workspace.glob("*.partial"))
     again, whole = results(workspace), results(tiny_survey)
