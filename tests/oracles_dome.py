@@ -5,7 +5,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import root
-from scipy.spatial.transform import Rotation
 
 from camera_calib.ports.dome import DomePort
 
@@ -19,39 +18,38 @@ def traced(port: DomePort, ray_air: Array) -> tuple[Array, Array, Array]:
     difference of the angles of incidence and refraction.
     """
     centre = np.array([port.dome_x_m, port.dome_y_m, port.dome_z_m])
-    place, way = np.zeros(3), ray_air / np.linalg.norm(ray_air)
+    place, way = np.zeros(3), _unit(ray_air)
     radii = (port.outer_radius_m - port.glass_thickness_m, port.outer_radius_m)
     indices = (1.0, port.n_glass, port.n_water)
     places = []
     for surface in range(2):
         off = place - centre
-        reaches = np.roots([1.0, 2.0 * way @ off, off @ off - radii[surface] ** 2])
-        place = place + float(reaches.real.max()) * way
+        half = float(way @ off)
+        root_of = half**2 - float(off @ off) + radii[surface] ** 2
+        place = place + (math.sqrt(max(root_of, 0.0)) - half) * way
         normal = (place - centre) / radii[surface]
-        axis = np.cross(normal, way)
-        sine = float(np.linalg.norm(axis))
+        axis = _cross(normal, way)
+        sine = math.hypot(*axis)
         if sine > 0.0:
             bent = math.asin(indices[surface] / indices[surface + 1] * min(sine, 1.0))
             angle = bent - math.atan2(sine, float(normal @ way))
-            way = Rotation.from_rotvec(angle * axis / sine).apply(way)
+            way = math.cos(angle) * way + math.sin(angle) / sine * _cross(axis, way)
         places.append(place)
     return places[0], places[1], way
 
 
 def ray_to(port: DomePort, point_cam: Array) -> Array:
     """Unit ray in air whose light reaches a point: two components are sought by Powell's method."""
-    straight = point_cam / np.linalg.norm(point_cam)
-    side = np.cross(straight, [0.3, -0.5, 0.81])
-    side /= np.linalg.norm(side)
+    straight = _unit(point_cam)
+    side = _unit(np.cross(straight, [0.3, -0.5, 0.81]))
     up = np.cross(straight, side)
 
     def ray(sideways: Array) -> Array:
-        way = straight + sideways[0] * side + sideways[1] * up
-        return way / np.linalg.norm(way)
+        return _unit(straight + sideways[0] * side + sideways[1] * up)
 
     def miss(sideways: Array) -> Array:
         _, outer, way = traced(port, ray(sideways))
-        off = np.cross(way, (point_cam - outer) / np.linalg.norm(point_cam - outer))
+        off = _cross(way, _unit(point_cam - outer))
         return np.array([off @ side, off @ up])
 
     found = root(miss, np.zeros(2), method="hybr", options={"xtol": 1e-15})
@@ -81,4 +79,10 @@ def optical_path_slopes(port: DomePort, inner: Array, outer: Array, point_cam: A
 
 
 def _unit(vector: Array) -> Array:
-    return vector / np.linalg.norm(vector)
+    return vector / math.hypot(*vector)
+
+
+def _cross(first: Array, second: Array) -> Array:
+    """What `np.cross` gives for two vectors, in a twentieth of its time."""
+    (a, b, c), (d, e, f) = first.tolist(), second.tolist()
+    return np.array([b * f - c * e, c * d - a * f, a * e - b * d])
