@@ -45,7 +45,7 @@ class Made:
         ended = subprocess.run(
             ["bash", "-euo", "pipefail", "-c", script_of(DOCS / page)], cwd=folder,
             env={**os.environ, "PATH": path, "COLUMNS": "120", "BROWSER": "true"},
-            capture_output=True, text=True, timeout=MAX_S, preexec_fn=_on_one_core,
+            capture_output=True, text=True, timeout=MAX_S,
         )  # fmt: skip
         return folder, ended
 
@@ -82,11 +82,6 @@ class Made:
     def dive(self) -> Path:
         """A workspace of a few small pictures with rig and navigation, reconstructed."""
         return self.after("how-to/own-pictures.md") / "dive"
-
-
-def _on_one_core() -> None:
-    """Work is so little here that starting workers would cost more than they save."""
-    os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
 
 
 def _bring(folder: Path, *paths: Path) -> None:
