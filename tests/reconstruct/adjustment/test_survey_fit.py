@@ -320,6 +320,7 @@ def scale_error_and_sigma(found: AdjustedSurvey, scene: Scene) -> tuple[float, f
     return error, float(np.linalg.norm(by_mode))
 
 
+@pytest.mark.slow
 def test_scales_lie_within_their_sigmas_where_the_index_is_drawn(tmp_path: Path) -> None:
     drawn, counted, ignored = np.random.default_rng(4).normal(0, SIGMA, 12), [], []
     for seed, off in enumerate(drawn):

@@ -222,6 +222,7 @@ def test_a_wrong_parameter_moves_the_points_as_predicted(name: str, tmp_path: Pa
     assert np.linalg.norm(found - expected) < 0.1 * np.linalg.norm(expected)
 
 
+@pytest.mark.slow
 def test_with_random_errors_of_calibration_the_block_is_as_good_as_stated(tmp_path: Path) -> None:
     rng = np.random.default_rng(4)
     stations, points, too_sure, apart = [], [], [], []

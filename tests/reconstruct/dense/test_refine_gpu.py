@@ -127,6 +127,7 @@ def test_a_gpu_gives_what_the_processor_gives(tmp_path: Path, case: tuple[Any, .
     assert "simulated" in said
 
 
+@pytest.mark.slow
 def test_without_memory_of_the_gpu_the_processor_does_it_and_says_so(
     tmp_path: Path, case: tuple[Any, ...]
 ) -> None:

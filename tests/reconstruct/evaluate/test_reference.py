@@ -166,6 +166,7 @@ def test_cells_of_an_elevation_model_are_points_at_their_middles(
     assert found[-1, 2] == pytest.approx(3.99, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_a_real_cloud_is_read_in_local_metres(shared_data: Path) -> None:
     datum = Datum(46.842607083333334, -91.99455988888889)
     points, placed = read_reference(shared_data / "brighton_beach" / "model.laz", datum)

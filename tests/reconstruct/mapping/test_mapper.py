@@ -31,6 +31,8 @@ from tests.reconstruct.rig_survey import four_cameras
 from tests.reconstruct.scenes import Scene, make_scene, match_pictures
 from tests.reconstruct.true_models import pupils, rigid_rms, warped_scene
 
+NAMES = ("wide", "tele", "bow", "side")
+
 
 def seen_by_pinholes(scene: Scene) -> Observations:
     return replace(warped_scene(scene)[0], pairs=scene.pairs)
@@ -102,7 +104,7 @@ def test_the_scale_is_that_of_the_rig() -> None:
     assert align_similarity(*pupils(mapped, scene)).scale == pytest.approx(0.5, rel=5e-3)
 
 
-@pytest.mark.parametrize("names", [("wide", "tele", "bow", "side"), ("tele", "bow", "side")])
+@pytest.mark.parametrize("names", [NAMES, pytest.param(NAMES[1:], marks=pytest.mark.slow)])
 def test_any_number_of_unlike_cameras_map_to_the_same_truth(names: tuple[str, ...]) -> None:
     """Also without the camera whose frame is the rig's."""
     rig = four_cameras()

@@ -25,6 +25,7 @@ from reconstruct.ply import open_cloud
 from tests.oracles_dense import DATUM, FRAME, position_code
 from tests.reconstruct.mesh.test_run import OFFSET, STEP_M, bump, make_workspace
 
+pytestmark = pytest.mark.slow
 PAGE_PX = 512
 ERROR_M = 3e-4
 
@@ -233,7 +234,6 @@ def test_a_survey_smaller_than_a_stray_is_meshed(tmp_path: Path):
     assert np.abs(mesh.vertices[:, 2]).max() < ERROR_M
 
 
-@pytest.mark.slow
 def test_cells_are_the_same_bytes_with_two_workers(survey: Path, levels: list[CellLevel]):
     cloud, again = open_cloud(survey / "dense" / "cloud.ply"), survey / "again"
     with local_executor(2).start() as two:
@@ -245,7 +245,6 @@ def test_cells_are_the_same_bytes_with_two_workers(survey: Path, levels: list[Ce
             assert cell.path.read_bytes() == other.cells[key].path.read_bytes()
 
 
-@pytest.mark.slow
 def test_memory_of_a_pass_is_that_of_a_cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(surface, "_TILE_STEPS", (12, 12))
     peaks = []

@@ -91,7 +91,7 @@ def site() -> Scene:
     return make_scene(points=400)
 
 
-@settings(deadline=None, max_examples=10)
+@settings(deadline=None, max_examples=5)
 @given(seed=st.integers(0, 10_000), scale=st.floats(0.01, 100))
 def test_any_gauge_is_undone_when_navigation_is_exact(seed: int, scale: float) -> None:
     truth = gauge(seed, scale)
