@@ -60,7 +60,7 @@ def write_results(folder: Path, calibration: Calibration, found: Detections) -> 
     """
     held = hold_out(calibration.views, lambda views: recalibrate(calibration, views), locate)
     if held is not None and held.halves is not None:
-        calibration = _widened(calibration, halves_agreement(held.halves).widening)
+        calibration = _widen(calibration, halves_agreement(held.halves).widening)
     lost = [r for r in calibration.rejections if r.points]
     if lost:
         views = ", ".join(dict.fromkeys(r.view for r in lost))
@@ -78,7 +78,7 @@ def write_results(folder: Path, calibration: Calibration, found: Detections) -> 
     return whole
 
 
-def _widened(calibration: Calibration, factor: float) -> Calibration:
+def _widen(calibration: Calibration, factor: float) -> Calibration:
     """Sigmas times a factor, except for what both halves of the views have in common."""
     covariance = calibration.rig.covariance
     if factor == 1.0 or covariance is None:
