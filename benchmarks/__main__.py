@@ -16,7 +16,6 @@ import datetime as dt
 import json
 import math
 import shlex
-import shutil
 import signal
 import subprocess
 import sys
@@ -24,7 +23,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.machine import load, machine
+from benchmarks.machine import commit, load, machine
 from benchmarks.measured import measured, python
 from benchmarks.parts import PARTS, SHORT_REPEATS, Part, Settings, chosen
 from benchmarks.table import LEFT_OUT, Outcome, Run, outcome, write
@@ -40,7 +39,7 @@ def main() -> int:
         "date": dt.datetime.now().astimezone().isoformat(timespec="seconds"),
         "command": shlex.join(["python", "-m", "benchmarks", *sys.argv[1:]]),
         "quick": options.quick,
-        "commit": _commit(),
+        "commit": commit(),
         "machine": machine(("alice-survey",)),
     }
     signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -91,20 +90,6 @@ def _run(command: Sequence[str], log: Path) -> Run:
 
 def _say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
-
-
-def _commit() -> str | None:
-    """The sources' commit; None where they are in no repository."""
-    git = shutil.which("git")
-    if git is None:
-        return None
-    asked = subprocess.run(
-        [git, "describe", "--always", "--dirty", "--abbrev=12"],
-        cwd=Path(__file__).parent,
-        capture_output=True,
-        text=True,
-    )
-    return asked.stdout.strip() or None
 
 
 def _options() -> argparse.Namespace:

@@ -85,6 +85,7 @@ PARTS = (
     Part(name="refraction"),
     Part(name="bend", passes=_WORK),
     Part(name="precision", passes=_WORK, long=True),
+    Part(name="draws", passes=_WORK, long=True),
     Part(name="cluster", passes=_WORK, long=True, packages=("distributed",)),
     Part(name="scale", passes=_WORK, long=True),
     Part(name="many-pictures", passes=_WORK, long=True),
