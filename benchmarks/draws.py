@@ -60,7 +60,7 @@ KINDS = {
     "flat": (1.5, 1.3, ""),
     "tilted": (1.5, 1.3, "port_distance_m = 0.1\nport_tilt_deg = [2, 0]\n" + _GLASS),
     "dome": (1.5, 1.3, f"focal_mm = 16.75\ndome_centre_m = [0, 0, 0.005]\n{_DOME}"),
-    "fisheye": (3.6, 2.6, f'focal_mm = 7.64\nlens = "fisheye"\n{_DOME}'),
+    "fisheye": (3.6, 3.2, f'focal_mm = 7.64\nlens = "fisheye"\n{_DOME}'),
 }
 """Length and width of the area, and the camera."""
 HEIGHT, MEAN, SCALE, SURFACE = (
@@ -76,17 +76,17 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=5, help="surveys of each kind")
     options, about = parser.begin("numpy", "numba", "pycolmap")
     seeds = range(1 if options.quick else options.seeds)
-    rows = []
+    rows, code = [], commit()
     for kind, seed in ((kind, seed) for seed in seeds for kind in options.only):
         kept = options.work / f"{kind}-{seed}.json"
         if not kept.exists():
             began = time.process_time()
             row = survey(options.work / f"{kind}-{seed}", kind, seed)
             made = {"cpu_s": time.process_time() - began, "made": f"{datetime.now(UTC):%F %R}"}
-            made |= {"commit": commit(), "processor": about["processor"]}
+            made |= {"commit": code, "processor": about["processor"]}
             write_json(kept, plain({"kind": kind, "seed": seed, **row, **made}))
         rows.append(json.loads(kept.read_text()))
-        print({key: value for key, value in rows[-1].items() if key != "rig"}, flush=True)
+        print({k: v for k, v in rows[-1].items() if not k.startswith("rig")}, flush=True)
     figures = [
         f for kind in options.only for f in _figures(kind, [r for r in rows if r["kind"] == kind])
     ]

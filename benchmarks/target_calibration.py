@@ -5,7 +5,7 @@ ripples; OpenCV projects it; corner errors are random waves over every picture, 
 the board, and noise.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -23,10 +23,12 @@ from camera_calib.rig import Rig
 from camera_calib.target_shape import AS_DRAWN, TargetShape
 
 Array = NDArray[np.float64]
+Projection = Callable[[Array], Array]
+"""Points before a camera, (N, 3), to pixels."""
 
 GOAL_OF_SIGMA = (0.8, 1.25)
 MAX_GROWTH = 1.3
-_SIZE = (1600, 1200)
+SIZE = (1600, 1200)
 _LENS = {
     "fx_px": 1702.0, "fy_px": 1699.0, "cx_px": 805.0, "cy_px": 593.0,
     "k1": -0.11, "k2": 0.07, "p1": 3e-4, "p2": -4e-4, "k3": -0.01,
@@ -113,9 +115,8 @@ def _waves(points: Array, reach: float, rng: np.random.Generator) -> Array:
     return field
 
 
-def views_of(target: Board, rng: np.random.Generator, count: int = _VIEWS) -> list[TargetView]:
-    """Views of one board, all of it in the frame."""
-    board, plain = bent(target, rng), drawn()
+def project(points: Array) -> Array:
+    """Pixels of points before the camera."""
     matrix = np.array(
         [
             [_LENS["fx_px"], 0.0, _LENS["cx_px"] - 0.5],
@@ -124,14 +125,27 @@ def views_of(target: Board, rng: np.random.Generator, count: int = _VIEWS) -> li
         ]
     )
     lens = np.array([_LENS[name] for name in ("k1", "k2", "p1", "p2", "k3")])
+    pixels = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, lens)[0][:, 0]
+    return np.asarray(pixels + 0.5)
+
+
+def views_of(
+    target: Board,
+    rng: np.random.Generator,
+    count: int = _VIEWS,
+    projection: Projection = project,
+    aside: float = 0.35 * SIZE[0] / _LENS["fx_px"],
+) -> list[TargetView]:
+    """Views of one board, all of it in the frame, aimed aside by a slope at most."""
+    board, plain = bent(target, rng), drawn()
     views: list[TargetView] = []
     while len(views) < count:
         turn = Rotation.from_rotvec(np.deg2rad([*rng.uniform(-35, 35, 2), rng.uniform(-20, 20)]))
         depth_m = rng.uniform(0.35, 1.0)
-        aim = np.append(rng.uniform(-0.35, 0.35, 2) * np.array(_SIZE) / _LENS["fx_px"], 1.0)
+        aim = np.append(rng.uniform(-aside, aside, 2) * np.array(SIZE) / SIZE[0], 1.0)
         place = depth_m * aim - turn.apply(plain.mean(axis=0))
-        pixels = cv2.projectPoints(board, turn.as_rotvec(), place, matrix, lens)[0][:, 0] + 0.5
-        if np.any((pixels < 5) | (pixels > np.array(_SIZE) - 5)):
+        pixels = projection(turn.apply(board) + place)
+        if not np.all((pixels >= 5) & (pixels <= np.array(SIZE) - 5)):
             continue
         pixels = pixels + rng.normal(0.0, target.alone_px, pixels.shape)
         if target.together_px:
@@ -142,7 +156,7 @@ def views_of(target: Board, rng: np.random.Generator, count: int = _VIEWS) -> li
 
 def true_rig() -> Rig:
     """One camera in air."""
-    camera = blank_camera(_SIZE, "opencv5").with_parameters(_LENS)
+    camera = blank_camera(SIZE, "opencv5").with_parameters(_LENS)
     return Rig(
         cameras={"camera": camera},
         cam_from_rig={"camera": RigidTransform.identity()},
