@@ -10,10 +10,11 @@ from dataclasses import asdict
 from typing import Any
 
 from alice_survey.core.executor import local_executor
-from benchmarks import camera_calibration, camera_speed, target_calibration
+from benchmarks import camera_calibration, camera_housings, camera_speed, target_calibration
 from benchmarks.figures import Findings, Parser, hand_over
+from tests.camera_calib.housing_scenes import KINDS
 
-_PARTS = ("speed", "calibration", "target")
+_PARTS = ("speed", "calibration", "target", "housings")
 
 
 def main() -> None:
@@ -24,11 +25,11 @@ def main() -> None:
     options, about = parser.begin("numpy", "numba", "opencv-contrib-python-headless", "pycolmap")
     report, findings = dict[str, Any](), Findings()
     if "speed" in options.only:
-        rows = camera_speed.measure(
+        speeds = camera_speed.measure(
             20_000 if options.quick else 100_000, 10 if options.quick else 40
         )
-        report["speed"] = [{**asdict(row), "ratio": row.ratio} for row in rows]
-        findings += Findings(figures=tuple(f for row in rows for f in row.figures()))
+        report["speed"] = [{**asdict(row), "ratio": row.ratio} for row in speeds]
+        findings += Findings(figures=tuple(row.figure() for row in speeds))
     if "calibration" in options.only:
         count = 40 if options.quick else 200
         modes = [
@@ -51,6 +52,11 @@ def main() -> None:
         findings += Findings(
             figures=tuple(f for case in cases for f in case.figures(judged=not options.quick))
         )
+    if "housings" in options.only:
+        count, workers = 2 if options.quick else 20, local_executor(options.threads)
+        rows = [r for k in KINDS for r in camera_housings.run_kind(k, range(count), workers)]
+        report["housings"] = rows
+        findings += Findings(figures=tuple(camera_housings.figures(rows)))
     sys.exit(hand_over(options, about, findings, report))
 
 

@@ -12,7 +12,6 @@ and the best of each counts, so that what else the machine does slows nobody alo
 import sys
 import time
 from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 
@@ -26,8 +25,6 @@ from benchmarks.figures import Figure, Goal
 from camera_calib.camera import Camera
 from camera_calib.rig import design_rig
 
-_CORES = 2
-_POOL = ThreadPoolExecutor(_CORES)
 _SAME_PX = 1e-9
 _UNTIL = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-9)
 
@@ -38,31 +35,23 @@ class Row:
 
     what: str
     ours: float
-    ours_two_cores: float
     peer: str
     theirs: float
-    theirs_two_cores: float
     goals: tuple[float, ...] = ()
-    """The least ratios on one core that are requested."""
+    """The least ratios that are requested."""
 
     @property
     def ratio(self) -> float:
-        """Ours over theirs, on one core."""
+        """Ours over theirs."""
         return self.ours / self.theirs
 
-    def figures(self) -> list[Figure]:
-        """On one core, and on two."""
+    def figure(self) -> Figure:
+        """Ours next to theirs."""
         goal = Goal(minimum=max(self.goals), of="ratio") if self.goals else None
-        return [
-            Figure(
-                name=self.what, value=self.ours, unit="M points/s", peer=self.peer,
-                peer_value=self.theirs, goal=goal,
-            ),
-            Figure(
-                name=f"{self.what}, two cores", value=self.ours_two_cores, unit="M points/s",
-                peer=self.peer, peer_value=self.theirs_two_cores,
-            ),
-        ]  # fmt: skip
+        return Figure(
+            name=self.what, value=self.ours, unit="M points/s", peer=self.peer,
+            peer_value=self.theirs, goal=goal,
+        )  # fmt: skip
 
 
 def lens_camera() -> Camera:
@@ -116,26 +105,16 @@ def measure(points_count: int, runs: int) -> list[Row]:
         "COLMAP's img_from_cam": (colmap.img_from_cam, points),
         "COLMAP's cam_from_img": (colmap.cam_from_img, pixels),
     }
-    one = {name: partial(work, rows) for name, (work, rows) in works.items()}
-    two = {f"{name}, two cores": _shared(*work) for name, work in works.items()}
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
-        best = race({**one, **two}, runs)
+        best = race({name: partial(work, rows) for name, (work, rows) in works.items()}, runs)
     finally:
         cv2.setNumThreads(threads)
     speed = {name: points_count / seconds / 1e6 for name, seconds in best.items()}
 
     def row(what: str, ours: str, peer: str, *goals: float) -> Row:
-        return Row(
-            what=what,
-            ours=speed[ours],
-            ours_two_cores=speed[f"{ours}, two cores"],
-            peer=peer,
-            theirs=speed[peer],
-            theirs_two_cores=speed[f"{peer}, two cores"],
-            goals=goals,
-        )
+        return Row(what=what, ours=speed[ours], peer=peer, theirs=speed[peer], goals=goals)
 
     return [
         row("project", "project", "cv2.projectPoints", 1.0, 2.0),
@@ -165,12 +144,6 @@ def _timed(work: Callable[[], object]) -> float:
     started = time.perf_counter()
     work()
     return time.perf_counter() - started
-
-
-def _shared(work: Callable[[Array], object], rows: Array) -> Callable[[], object]:
-    """The work on all cores, each with its share of the rows."""
-    shares = np.array_split(rows, _CORES)
-    return lambda: list(_POOL.map(work, shares))
 
 
 def _same(what: str, found: Array, expected: Array, limit_px: float) -> None:

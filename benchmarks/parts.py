@@ -74,15 +74,15 @@ _WORK = ("work",)
 _PEER = ("coverage_path_planner",)
 PARTS = (
     Part(name="camera-speed", module="camera", arguments="--only speed"),
-    Part(name="camera-pose", module="camera", arguments="--only pose"),
-    Part(name="camera-calibration", module="camera", arguments="--only calibration target"),
+    Part(
+        name="camera-calibration", module="camera", arguments="--only calibration target housings"
+    ),
     Part(name="planner", packages=_PEER),
     Part(name="planner-angles", module="planner", arguments="--angles", long=True, packages=_PEER),
     Part(name="studio"),
     Part(name="vehicle"),
     Part(name="missions"),
     Part(name="faults", packages=("rclpy",)),
-    Part(name="refraction"),
     Part(name="bend", passes=_WORK),
     Part(name="precision", passes=_WORK, long=True),
     Part(name="draws", passes=_WORK, long=True),
@@ -95,13 +95,6 @@ PARTS = (
         module="reconstruct",
         arguments="--only peers",
         passes=("work", "demo", "pyorthomosaic"),
-        long=True,
-    ),
-    Part(
-        name="reconstruct-growth",
-        module="reconstruct",
-        arguments="--only growth",
-        passes=_WORK,
         long=True,
     ),
     Part(name="harbour", passes=_WORK, long=True),

@@ -1,17 +1,16 @@
 """Reconstruction next to stock COLMAP and pyOrthomosaic on the same pictures, in one run.
 
     .venv/bin/python -m benchmarks.reconstruct --work FOLDER [--demo WORKSPACE]
-        [--pyorthomosaic PYTHON] [--limit SECONDS] [--only peers,growth,hierarchical]
-        [--pictures 50,100] [--sparse] [--large 400] [--quick] [--json FILE]
+        [--pyorthomosaic PYTHON] [--limit SECONDS] [--only peers,hierarchical]
+        [--pictures 50,100] [--large 400] [--quick] [--json FILE]
 
 `peers`: rendered pictures of the demo (quarter resolution), 50 and 100 by default. Wall and
 processor time, peak memory with children, pictures registered, and errors against the truth. Our
 model is aligned rigidly; the others know no scale and are aligned with a free one. COLMAP ends at
-the sparse model; with `--sparse` ours does too, and pyOrthomosaic is left out.
+the sparse model.
 Ours runs on a few pictures first, so that its kernels are compiled, as the others' are.
-`growth`: our own cost on 50, 100, 200 and 400 pictures at an eighth of the resolution.
-`hierarchical`: to the sparse model of the first 400 (`--large`) of these, next to COLMAP's
-hierarchical and global mappers, which match neighbours by navigation.
+`hierarchical`: to the sparse model of 400 (`--large`) at an eighth of the resolution, next to
+COLMAP's hierarchical and global mappers, which match neighbours by navigation.
 
 pyOrthomosaic (MIT licence, PyPI) is in the extra `bench`; `--pyorthomosaic` names the Python of
 another environment that has it. What is not there is left out, and said.
@@ -25,13 +24,13 @@ from pathlib import Path
 
 from benchmarks.figures import Findings, Parser, hand_over
 from benchmarks.measured import Cost, measured, python
-from benchmarks.reconstruct_figures import against_peers, grown
+from benchmarks.reconstruct_figures import against_peers
 from benchmarks.reconstruct_scores import Accuracy, score_ours, score_peer
 from benchmarks.reconstruct_surveys import pictures_of, render, subset, survey_toml
 
-PARTS = ("peers", "growth", "hierarchical")
+PARTS = ("peers", "hierarchical")
 NO_PYORTHOMOSAIC = "pyorthomosaic: not installed; give --pyorthomosaic PYTHON"
-_GROWN, _GROWN_QUICK = (50, 100, 200, 400), (12, 24)
+_LARGE, _LARGE_QUICK = 400, 24
 _PEERS = Path(__file__).with_name("reconstruct_peers.py")
 _STAGES = {"sparse": ("mapping", "placing"), "dense": ("dense",), "mosaic": ("mosaic",)}
 """Of ours, by what they end in."""
@@ -70,26 +69,20 @@ def peer(
 
 
 def run_peers(
-    work: Path,
-    demo: Path,
-    interpreter: str | None,
-    counts: Sequence[int],
-    limit_s: float,
-    ends: Sequence[str] = tuple(_STAGES),
+    work: Path, demo: Path, interpreter: str | None, counts: Sequence[int], limit_s: float
 ) -> Findings:
     """All programs on the same rendered pictures; ours compiled beforehand."""
-    findings, to_mosaic = Findings(), "mosaic" in ends
-    ours(subset(demo, work / "compiled", 8), ends)
+    findings = Findings()
+    ours(subset(demo, work / "compiled", 8))
     for count in counts:
         part = subset(demo, work / f"peers{count}", count)
         folder = work / f"peers{count}_pictures"
         _emptied(folder)
         pictures_of(part, folder)
-        costs = ours(part, ends)
+        costs = ours(part)
         found = score_ours(part) if costs["sparse"].ok else None
         rivals: dict[str, tuple[Cost | None, Accuracy | None]] = {}
-        programs = (("colmap", sys.executable), ("pyorthomosaic", interpreter))
-        for name, python_of in programs if to_mosaic else programs[:1]:
+        for name, python_of in (("colmap", sys.executable), ("pyorthomosaic", interpreter)):
             if python_of is None:
                 findings += Findings(left_out=(f"{count} pictures: {NO_PYORTHOMOSAIC}",))
                 rivals[name] = (None, None)
@@ -102,23 +95,10 @@ def run_peers(
     return findings
 
 
-def run_growth(work: Path, counts: Sequence[int], scale: int) -> Findings:
-    """Our own cost a picture as surveys grow."""
-    findings = Findings()
-    whole = work / f"growth_{max(counts)}"
-    render(whole, survey_toml(max(counts), scale))
-    for count in counts:
-        part = subset(whole, work / f"growth{count}", count)
-        costs = ours(part)
-        found = score_ours(part) if costs["sparse"].ok else None
-        findings += grown(count, costs, found)
-    return findings
-
-
-def run_hierarchical(work: Path, count: int, rendered: int, limit_s: float) -> Findings:
+def run_hierarchical(work: Path, count: int, limit_s: float) -> Findings:
     """Ours next to mappers that are made for many pictures."""
-    whole = work / f"growth_{rendered}"
-    render(whole, survey_toml(rendered, 8))
+    whole = work / f"rendered_{count}"
+    render(whole, survey_toml(count, 8))
     ours(subset(whole, work / "compiled", 8), ["sparse"])
     part = subset(whole, work / f"hierarchical{count}", count)
     pictures = pictures_of(part, _emptied(work / f"hierarchical{count}_pictures"))
@@ -167,8 +147,7 @@ def main() -> int:
         "--limit", type=float, default=3600.0, help="seconds that another program may take"
     )
     parser.add_argument("--pictures", default="50,100", help="of `peers`, by commas")
-    parser.add_argument("--large", type=int, default=_GROWN[-1], help="of `hierarchical`")
-    parser.add_argument("--sparse", action="store_true", help="end `peers` at the sparse model")
+    parser.add_argument("--large", type=int, default=_LARGE, help="of `hierarchical`")
     given, about = parser.begin("pycolmap", "opencv-contrib-python-headless", "numpy")
     parts = given.only.split(",")
     if unknown := set(parts) - set(PARTS):
@@ -181,15 +160,11 @@ def main() -> int:
         if demo is None:
             demo = work / "demo"
             render(demo, survey_toml(20 if given.quick else 116, 8 if given.quick else 4))
-        ends = list(_STAGES)[: 1 if given.sparse else None]
         counts = [16] if given.quick else [int(n) for n in given.pictures.split(",")]
-        findings += run_peers(work, demo.resolve(), interpreter, counts, given.limit, ends)
-    if "growth" in parts:
-        findings += run_growth(work, _GROWN_QUICK if given.quick else _GROWN, 8)
+        findings += run_peers(work, demo.resolve(), interpreter, counts, given.limit)
     if "hierarchical" in parts:
-        maximum = (_GROWN_QUICK if given.quick else _GROWN)[-1]
-        large = maximum if given.quick else given.large
-        findings += run_hierarchical(work, large, max(large, maximum), given.limit)
+        large = _LARGE_QUICK if given.quick else given.large
+        findings += run_hierarchical(work, large, given.limit)
     return hand_over(given, about, findings)
 
 

@@ -1,4 +1,4 @@
-"""The figures of `benchmarks.reconstruct`: ours and those of other programs, or ours alone."""
+"""The figures of `benchmarks.reconstruct`: ours and those of other programs."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -41,20 +41,6 @@ def against_peers(
         if cost is not None and not cost.ok:
             findings += Findings(left_out=(f"{where}, {name}: {cost.last_line()}",))
     return findings
-
-
-def grown(count: int, costs: Mapping[str, Cost], found: Accuracy | None) -> Findings:
-    """Cost of each of our stages a picture."""
-    numbers: _Numbers = {}
-    for stage, cost in costs.items():
-        if cost.ok:
-            numbers[f"{stage}, time a picture"] = (cost.wall_s / count, "s")
-            numbers[f"{stage}, processor time a picture"] = (cost.cpu_s / count, "s")
-            numbers[f"{stage}, peak memory"] = (cost.peak_mib, "MiB")
-    if found is not None:
-        numbers["registered"] = (found.registered, "pictures")
-    where = f"{count} pictures"
-    return Findings(figures=tuple(_figures(where, numbers)), failed=failures(where, costs))
 
 
 def failures(where: str, costs: Mapping[str, Cost]) -> tuple[str, ...]:

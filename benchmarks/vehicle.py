@@ -22,7 +22,7 @@ from alice_survey.sim.vehicle.pilot.memory import DONE, NONE, PHASE, REASON
 from alice_survey.sim.vehicle.sea import FloorGrid, level_floor
 from alice_survey.sim.vehicle.simulator import Setup, simulate
 from benchmarks import vehicle_seas
-from benchmarks.figures import Figure, Findings, Goal, Parser, hand_over, markdown
+from benchmarks.figures import Figure, Findings, Goal, Parser, hand_over
 from camera_calib.rig import design_rig
 from missions.fly.simulation import flight_settings, mission_setup
 from missions.plan.planner import plan_survey
@@ -46,7 +46,6 @@ def main() -> int:
         )
     if "seas" in options.only:
         seas = vehicle_seas.measure(1 if options.quick else 5)
-        print(*markdown(vehicle_seas.table(seas)), sep="\n", flush=True)
         report["seas"] = [asdict(row) for row in seas]
         findings += Findings(figures=tuple(vehicle_seas.figures(seas)))
     return hand_over(options, about, findings, report)

@@ -177,19 +177,6 @@ def _finite(values: Array) -> Array:
     return values[np.isfinite(values)]
 
 
-def table(rows: list[SeaResult]) -> list[dict[str, str]]:
-    """The cases."""
-    return [
-        {
-            "sea": row.sea, "complete": f"{row.complete} of {row.flights}",
-            "true, m rms (worst)": f"{row.true_m:.3f} ({row.worst_m:.2f})",
-            "believed, m": f"{row.believed_m:.3f}", "heading, deg": f"{row.heading_deg:.1f}",
-            "Wh": f"{row.energy_wh:.0f}", "endings": "; ".join(row.endings),
-        }
-        for row in rows
-    ]  # fmt: skip
-
-
 def figures(rows: list[SeaResult]) -> list[Figure]:
     """The figures of all cases."""
     return [

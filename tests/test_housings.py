@@ -6,9 +6,11 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from alice_survey.core.artefacts import read_json
+from benchmarks import draws
 from benchmarks.reconstruct_surveys import demo_like
 from camera_calib.calibrate import from_pictures
 from camera_calib.calibrate.detect_views import Detections, detect_views
@@ -110,3 +112,19 @@ def test_a_fisheye_of_120_degrees_is_surveyed(tmp_path: Path) -> None:
     """Most of a sigma is the calibration's, which has one draw: three seeds give 0.48 to 1.74."""
     score = surveyed(tmp_path / "fisheye", FISHEYE, 3.6, 3.2, scale=6)
     check(score, 3.6, 3.2, (0.3, 2.5))
+
+
+def test_a_survey_with_a_drawn_calibration_errs_by_what_it_states(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(draws.KINDS, "flat", (1.0, 1.1, ""))
+    row = draws.survey(tmp_path / "flat", "flat", 3)
+    assert row["pictures"] == row["of"] >= 16
+    for name in (draws.HEIGHT, draws.MEAN, draws.SCALE):
+        assert abs(row[name]) < 4.0
+    assert 0.2 < row[draws.SURFACE] < 4.0
+    for name in (draws.BEFORE, draws.RIG):
+        over = np.abs([*row[name].values()])
+        assert len(over) >= 28
+        assert 0.3 < np.sqrt(np.mean(over**2)) < 2.2
+        assert over.max() < 5.0

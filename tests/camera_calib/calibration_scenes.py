@@ -9,9 +9,13 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.config import CameraConfig, WaterConfig
 from alice_survey.core.frames import Array
+from camera_calib.calibrate.detect_views import Detections
+from camera_calib.calibrate.from_pictures import calibrate_task
+from camera_calib.calibrate.options import CalibrateOptions, task_of
 from camera_calib.calibration import TargetView
 from camera_calib.freedom import POSE, value
 from camera_calib.rig import Rig, design_rig
+from camera_calib.targets.target import parse_target
 from tests.cameras import changed
 
 DESIGN = design_rig(CameraConfig(), WaterConfig())
@@ -179,3 +183,27 @@ def differences(found: Rig, truth: Rig) -> dict[str, float]:
         between = {f"{name}.{axis}": float(one) for axis, one in zip(POSE, turn, strict=False)}
         errors |= {key: one for key, one in between.items() if key in errors}
     return errors
+
+
+def errors_over_sigmas(found: Rig, truth: Rig) -> dict[str, float]:
+    """Error over sigma of every parameter that was found."""
+    errors = differences(found, truth)
+    return {key: errors[key] / sigma for key, sigma in found.sigmas.items()}
+
+
+def rig_of_corners(truth: Rig, design: CameraConfig, seed: int, stream: int) -> Rig:
+    """A rig as `calibrate` finds it in air, then in water, from corners with 0.03 px of noise."""
+    target = parse_target("chessboard 11x8 40mm")
+    sizes = {name: (camera.width_px, camera.height_px) for name, camera in truth.cameras.items()}
+    known: dict[str, Any] = {"water": True, "port": design.port, "n_glass": f"{design.n_glass}"}
+    known |= {"glass_mm": f"{1e3 * design.glass_thickness_m}"}
+    if design.port == "dome":
+        known["dome_radius_mm"] = f"{1e3 * design.dome_radius_m}"
+    lens, found = "fisheye" if design.lens == "fisheye" else "opencv5", None
+    for wet, rig in enumerate((in_air(truth), truth)):
+        views = scene(rig, 12, [seed, wet, stream], 0.03, target.points, near_m=0.6, far_m=1.6)
+        options = CalibrateOptions(lens=lens, **(known if wet else {}))
+        task = task_of(options, dict.fromkeys(sizes, "corners"), target, found)
+        found = calibrate_task(task, Detections(views=tuple(views), sizes=sizes, rejections=())).rig
+    assert found is not None
+    return replace(found, body_from_rig=truth.body_from_rig)

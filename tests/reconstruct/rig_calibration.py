@@ -16,7 +16,7 @@ from scipy.spatial.transform import RigidTransform
 from alice_survey.core.executor import Executor, local_executor
 from camera_calib.rig import Rig, read_rig
 from camera_calib.targets.target import parse_target
-from tests.camera_calib.calibration_scenes import differences, in_air, views_of_some
+from tests.camera_calib.calibration_scenes import errors_over_sigmas, in_air, views_of_some
 from tests.oracles_targets import light_through, to_srgb
 from tests.reconstruct.rig_survey import (
     command,
@@ -77,16 +77,10 @@ def calibrated_rig(folder: Path, executor: Executor) -> Path:
     return found
 
 
-def errors_over_sigmas(rig: Rig) -> dict[str, float]:
-    """Error over sigma of every parameter that was found."""
-    errors = differences(rig, four_cameras())
-    return {key: errors[key] / sigma for key, sigma in rig.sigmas.items()}
-
-
 if __name__ == "__main__":
     work = Path(sys.argv[1])
     path = calibrated_rig(work, local_executor())
-    over = errors_over_sigmas(read_rig(path))
+    over = errors_over_sigmas(read_rig(path), four_cameras())
     sys.stdout.write("".join(f"{key} {value:+.2f}\n" for key, value in over.items()))
     values = np.abs(list(over.values()))
     sys.stdout.write(f"error over sigma {np.sqrt(np.mean(values**2)):.2f}, {values.max():.2f}\n")

@@ -10,8 +10,16 @@ from alice_survey.core.artefacts import read_json
 from alice_survey.core.executor import local_executor
 from alice_survey.core.records import PortRecord
 from camera_calib.rig import Rig, read_rig
-from tests.reconstruct.rig_calibration import calibrated_rig, errors_over_sigmas
-from tests.reconstruct.rig_survey import MOMENTS, RigScore, import_survey, render_survey, score
+from tests.camera_calib.calibration_scenes import errors_over_sigmas
+from tests.reconstruct.rig_calibration import calibrated_rig
+from tests.reconstruct.rig_survey import (
+    MOMENTS,
+    RigScore,
+    four_cameras,
+    import_survey,
+    render_survey,
+    score,
+)
 
 LINES = 2
 NAMES = ("wide", "tele", "bow", "side")
@@ -36,7 +44,7 @@ def check(found: RigScore, pictures: int, max_px: float) -> None:
 
 def check_calibration(folder: Path, rig: Rig) -> None:
     """Errors of what was found in pictures of a board, over its sigmas, and what is reported."""
-    over = np.array(list(errors_over_sigmas(rig).values()))
+    over = np.array(list(errors_over_sigmas(rig, four_cameras()).values()))
     assert len(over) == 12 + 12 + 12 + 11 + 3 * 6
     assert 0.6 < np.sqrt(np.mean(over**2)) < 1.4
     assert np.abs(over).max() < 4.0

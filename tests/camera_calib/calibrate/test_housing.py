@@ -10,6 +10,7 @@ from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
 from alice_survey.core.errors import CalibrationError
+from benchmarks.camera_housings import PARTS, run_trial
 from camera_calib.calibrate.detect_views import Detections
 from camera_calib.calibrate.from_pictures import calibrate_task
 from camera_calib.calibrate.options import CalibrateOptions, task_of
@@ -28,6 +29,7 @@ from camera_calib.ports.values import PortValues
 from camera_calib.rig import Rig
 from camera_calib.targets.target import parse_target
 from tests.camera_calib.calibration_scenes import BOARD, built_rig, in_air, scene
+from tests.camera_calib.housing_scenes import GLASS_M, INDICES, KINDS, Housing
 from tests.oracles_dome import ray_to
 
 TRUTH = built_rig()
@@ -174,3 +176,28 @@ def test_the_lens_is_found_by_what_it_leaves() -> None:
         best = min(found.housing_trials, key=lambda trial: trial.criterion)
         assert best.lens == USUAL_LENS[model]
         assert {one.lens for one in found.housing_trials} == set(USUAL_LENS.values())
+
+
+def test_rays_to_a_board_are_those_of_another_tracer() -> None:
+    centre, points = np.array([0.001, -0.002, 0.006]), np.array([[0.1, 0.2, 0.6], [-0.3, 0.1, 0.5]])
+    rays = Housing(inner_m=0.07, centre=centre).rays_to(points)
+    shift = dict(zip(("dome_x_m", "dome_y_m", "dome_z_m"), centre.tolist(), strict=True))
+    port = DomePort(
+        **shift, outer_radius_m=0.07 + GLASS_M, glass_thickness_m=GLASS_M,
+        n_glass=INDICES[1], n_water=INDICES[2],
+    )  # fmt: skip
+    expected = [ray_to(port, point) for point in points]
+    np.testing.assert_allclose(rays / np.linalg.norm(rays, axis=1)[:, None], expected, atol=1e-13)
+    plane = FlatPort(
+        port_distance_m=0.07, glass_thickness_m=GLASS_M, n_glass=INDICES[1], n_water=INDICES[2]
+    )
+    flat = Housing(inner_m=0.07, centre=np.zeros(3), normal=np.array([0.0, 0.0, 1.0]))
+    seen = replace(AIR, port=plane).project(points)
+    np.testing.assert_allclose(AIR.project(flat.rays_to(points)), seen, atol=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_lens_and_port_are_chosen_rightly_by_all_views_and_by_halves(kind: str) -> None:
+    row = run_trial(3, kind)
+    assert all(row[f"{part}: right"] for part in PARTS), row
