@@ -144,20 +144,15 @@ def _sigma(by_each: Any, covariance: Any) -> float:
 
 def _figures(kind: str, rows: list[Mapping[str, Any]], *, judged: bool = False) -> list[Figure]:
     """What surveys of a kind, or all, come to."""
-    near, rig = (
-        Goal(minimum=0.8, maximum=1.25),
-        np.array([v for r in rows for v in r[RIG].values()]),
-    )
-    height, farthest = Goal(minimum=-0.3, maximum=0.3), Goal(maximum=2.5)
+    rig, before = (np.array([z for r in rows for z in r[of].values()]) for of in (RIG, BEFORE))
+    one = {what: np.array([row[what] for row in rows]) for what in (HEIGHT, MEAN, SCALE, SURFACE)}
+    near, height = Goal(minimum=0.8, maximum=1.25), Goal(minimum=-0.3, maximum=0.3)
     values: list[tuple[str, float, Goal | None]] = [
-        (f"{HEIGHT}, mean", np.mean([row[HEIGHT] for row in rows]), height),
-        *(
-            (f"{what}, rms", rms([row[what] for row in rows]), near)
-            for what in (MEAN, SCALE, SURFACE)
-        ),
-        (f"{BEFORE}, rms", rms([v for r in rows for v in r[BEFORE].values()]), None),
+        (f"{HEIGHT}, mean", np.mean(one[HEIGHT]), height),
+        *((f"{what}, rms", rms(one[what]), near) for what in (MEAN, SCALE, SURFACE)),
+        (f"{BEFORE}, rms", rms(before), None),
         (f"{RIG}, rms", rms(rig), near),
-        (f"{RIG}, largest", np.abs(rig).max(), farthest),
+        (f"{RIG}, largest", np.abs(rig).max(), Goal(maximum=2.5)),
         (f"{RIG}, share beyond 2.5", np.mean(np.abs(rig) > 2.5), None),
     ]
     return [
