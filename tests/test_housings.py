@@ -104,8 +104,8 @@ def test_a_dome_off_its_centre_is_surveyed_and_no_other_port_passes_for_it(
     bare = pool_as(workspace, tmp_path / "bare", "none", **start)
     assert any("from its prior" in text for text in bare)
     pool_as(workspace, tmp_path / "auto", "auto", **dome)
-    found = read_rig(tmp_path / "auto" / "rig.json")
-    assert {camera.port.shape for camera in found.cameras.values()} == {"dome"}
+    rig = read_rig(tmp_path / "auto" / "rig.json")
+    assert {camera.port.shape for camera in rig.cameras.values()} == {"dome"}
 
 
 def test_a_fisheye_of_120_degrees_is_surveyed(tmp_path: Path) -> None:
