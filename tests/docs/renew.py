@@ -1,6 +1,7 @@
-"""Make the pictures of the tutorial and of `docs/studio.md` again.
+"""Make the pictures of the tutorial and of `docs/studio.md` again, or the front page's from a demo.
 
     python -m tests.docs.renew [FOLDER]
+    python -m tests.docs.renew --demo DEMO
 
 The tutorial's own commands are run first, but for a folder where they were; nothing in it changes.
 """
@@ -42,6 +43,9 @@ def main() -> None:
     """Run the tutorial unless it was, and draw its pictures and those of the studio."""
     with tempfile.TemporaryDirectory() as name:
         scratch = Path(name)
+        if sys.argv[1:2] == ["--demo"]:
+            front_page(Path(shutil.copytree(sys.argv[2], scratch / "demo")))
+            return
         made = Path(sys.argv[1]) if sys.argv[1:] else Made(scratch).after(TUTORIAL)
         copy = Path(shutil.copytree(made / "reef", scratch / "copy" / "reef"))
         for file, (width, paths) in SHEETS.items():
@@ -52,6 +56,25 @@ def main() -> None:
             page.goto((copy / "report" / "report.html").as_uri())
             photograph(page, DOCS / "tutorial" / "report.jpg", 1500)
         photograph_studio(copy, DOCS / "studio")
+
+
+def front_page(demo: Path) -> None:
+    """What the demo makes, and the studio that measures in it beside the error of its surface."""
+    picture, errors, studio = (demo / name for name in ("left.png", "errors.png", "studio.jpg"))
+    whole = Image.open(demo / "evaluation" / "errors.png")
+    whole.crop((0, 0, whole.width * 57 // 100, whole.height)).save(errors)
+    Image.open(demo / "images" / "left" / "000048.png").save(picture)
+    with serving(demo) as server, begun_page(WIDE) as (page, _):
+        page.goto(server.address)
+        page.wait_for_selector("body[data-ready]")
+        page.locator("#tab-model").click()
+        page.wait_for_timeout(4000)
+        measure(page)
+        photograph(page, studio, 1500)
+    rows = ([picture, demo / "dense" / "dem.png"], [demo / "mosaic" / "mosaic.png", errors])
+    parts = [ImageOps.pad(side_by_side(row, 1100), (1100, 540), color="white") for row in rows]
+    Image.fromarray(np.vstack(parts)).save(DOCS / "demo.jpg", quality=80)
+    side_by_side([studio, errors], 1636).save(DOCS / "front.jpg", quality=80)
 
 
 def side_by_side(paths: list[Path], width: int) -> Image.Image:
@@ -91,7 +114,6 @@ def measure(page: Any) -> None:
     box = page.locator("#map-canvas")
     east, north = (float(box.get_attribute(f"data-{axis}")) for axis in ("east", "north"))
     size = 130 / 2 ** float(box.get_attribute("data-zoom"))
-    east -= 0.85 * size  # the list of layers takes the right of the map
     button(page, "Area").click()
     corners = ((-1, -1), (0.2, -1.3), (0.6, 0.1), (-0.5, 0.5))
     click(page, *((east + size * e, north + size * n) for e, n in corners))
