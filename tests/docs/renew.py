@@ -73,7 +73,9 @@ def front_page(demo: Path) -> None:
         photograph(page, studio, 1500)
     rows = ([picture, demo / "dense" / "dem.png"], [demo / "mosaic" / "mosaic.png", errors])
     parts = [ImageOps.pad(side_by_side(row, 1100), (1100, 540), color="white") for row in rows]
-    Image.fromarray(np.vstack(parts)).save(DOCS / "demo.jpg", quality=80)
+    Image.fromarray(np.vstack([np.asarray(part) for part in parts])).save(
+        DOCS / "demo.jpg", quality=80
+    )
     side_by_side([studio, errors], 1636).save(DOCS / "front.jpg", quality=80)
 
 
