@@ -19,7 +19,6 @@ each camera and size of pictures, and of the right camera's pose -T_x (mm), T_y,
 vector RX, CV, RZ, as stereolabs' zed-stereo-calibration writes them.
 """
 
-import json
 import re
 from collections.abc import Callable, Mapping
 from configparser import ConfigParser
@@ -183,7 +182,7 @@ def read_ros(path: Path, reading: rigs.ReadOptions) -> Rig:
     found: dict[tuple[Path, str], tuple[Path, _RosCamera]] = {}
     for file in files:
         for document in fields.read_documents(file):
-            same = file, json.dumps(document | {"header": None}, sort_keys=True, default=str)
+            same = file, repr(document | {"header": None})
             if same not in found:
                 found[same] = file, _RosCamera.check(file, document, "", ())
     every = list(found.values())

@@ -140,6 +140,7 @@ def test_faults_name_file_and_key(tmp_path: Path) -> None:
         ("image_width: 2448\n", "", "--image-size"),
         ("0, 0, 1]\nd", "0, 0]\nd", "camera_matrix"),
         ("4827.94, 0,", "4827.94, 1,", "camera_matrix"),
+        ("data:", "0:", "camera_matrix"),  # a number among the names
         ("cols: 4", "cols: 3", "projection_matrix"),
     ):
         assert named in fault(path, SAMPLE.replace(old, new, 1))
