@@ -49,7 +49,6 @@ class PaperRule:
     """
 
     rate_hz: float
-    interval_s: float
     forward_overlap: float
     """What it really gives with this footprint."""
 
@@ -58,9 +57,7 @@ def paper_rule(plan: PlanConfig, footprint_along_m: float) -> PaperRule:
     """The paper's frame rate and the overlap that it really gives."""
     rate_hz = plan.speed_mps / (plan.altitude_m * (1.0 - plan.forward_overlap))
     return PaperRule(
-        rate_hz=rate_hz,
-        interval_s=1.0 / rate_hz,
-        forward_overlap=overlap(footprint_along_m, plan.speed_mps / rate_hz),
+        rate_hz=rate_hz, forward_overlap=overlap(footprint_along_m, plan.speed_mps / rate_hz)
     )
 
 
