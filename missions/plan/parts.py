@@ -71,7 +71,7 @@ def plan_parts(
     whole, tied = PlannedDives(lines=(), dives=(), sweep=None), True
     for number, (part, home) in enumerate(parts):
         more = _plan_part(part, settings, pattern, costs, home, usable_wh, depth_m, zones)
-        dives = (dive.from_line(len(whole.lines)) for dive in more.dives)
+        dives = (dive.shift_lines(len(whole.lines)) for dive in more.dives)
         tied = tied and all(
             after.first_line == before.last_line + 1 and more.lines[after.first_line].kind == "tie"
             for before, after in pairwise(more.dives)
@@ -174,6 +174,6 @@ def with_ties(planned: PlannedDives) -> PlannedDives:
         own = list(planned.lines[dive.first_line : dive.last_line + 1])
         if dives and dive.first_line <= planned.dives[len(dives) - 1].last_line:
             own[0] = replace(own[0], kind="tie")
-        dives.append(dive.from_line(len(lines) - dive.first_line))
+        dives.append(dive.shift_lines(len(lines) - dive.first_line))
         lines += own
     return replace(planned, lines=tuple(lines), dives=tuple(dives))

@@ -53,8 +53,8 @@ class Dive:
         """Place where the vehicle is launched and recovered."""
         return self.route.legs[0].start_ne_m
 
-    def from_line(self, count: int) -> "Dive":
-        """The same with its lines counted from another one on."""
+    def shift_lines(self, count: int) -> "Dive":
+        """The same with the numbers of its lines raised by `count`."""
         legs = tuple(
             replace(leg, line=leg.line + count) if leg.line >= 0 else leg for leg in self.route.legs
         )

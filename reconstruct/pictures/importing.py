@@ -789,7 +789,7 @@ def _with_lines(first: Plan, second: Plan) -> Plan:
     return replace(
         first,
         lines=first.lines + second.lines,
-        dives=(*first.dives, *(dive.from_line(len(first.lines)) for dive in second.dives)),
+        dives=(*first.dives, *(dive.shift_lines(len(first.lines)) for dive in second.dives)),
         line_depths_m=(),
         length_m=first.length_m + second.length_m,
         duration_s=first.duration_s + second.duration_s,
