@@ -136,8 +136,6 @@ class LightBudget:
     """Electrons in the darkest corner."""
     median_e: float
     """Median of the mean of the channels over the frame."""
-    brightest_e: float
-    """Most electrons of any channel anywhere in the frame."""
     sharp_share: tuple[float, float, float]
     """Share of the electrons at the middle that came from the floor unscattered, and are detail."""
     snr_centre: tuple[float, float, float]
@@ -273,7 +271,6 @@ def light_budget(
         centre_e=_triple(electrons[centre]),
         corner_e=_triple(electrons[darkest]),
         median_e=median,
-        brightest_e=brightest,
         sharp_share=_triple(sharp[centre] / np.maximum(electrons[centre], 1e-30)),
         snr_centre=_triple(signal_to_noise(electrons[centre], noise_e, sharp[centre])),
         snr_median=float(signal_to_noise(np.array(median), noise_e, median_share * median)),

@@ -64,10 +64,6 @@ class Sweep:
     cost_j: float
     """Energy of the whole flight from home to home, as lines are ordered (`missions.lines.hops`).
     """
-    width_heading_rad: float
-    """Heading for which the total width of all cells is least."""
-    width_m: float
-    """Total width of all cells: how many lines are needed, times their spacing."""
 
 
 @step("look for the best heading")
@@ -78,7 +74,7 @@ def best_heading(task: LineTask) -> Sweep:
         PlanError: the area is too large, or cannot be flown at any heading.
     """
     check_size(task.area, task.pattern)
-    width_heading, width = min_width(task.site.survey)
+    width_heading, _ = min_width(task.site.survey)
     close: dict[float, float] = {}
     found: dict[float, float] = {}
     faults: list[PlanError] = []
@@ -118,9 +114,7 @@ def best_heading(task: LineTask) -> Sweep:
     if not found:
         raise faults[0]
     best = _minimum(found, 1)[0]
-    return Sweep(
-        heading_rad=best, cost_j=found[best], width_heading_rad=width_heading, width_m=width
-    )
+    return Sweep(heading_rad=best, cost_j=found[best])
 
 
 def _worthwhile(headings: Array, narrow: float, task: LineTask) -> Array:

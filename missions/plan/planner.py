@@ -181,12 +181,7 @@ def plan_survey(config: SurveyConfig, rig: Rig, *, max_cells: int | None = None)
         about = {
             "imaging": {**imaging.to_json(), "rows": [row.to_json() for row in rows]},
             "heading": sweep
-            and {
-                "heading_deg": math.degrees(sweep.heading_rad),
-                "cost_j": sweep.cost_j,
-                "least_width_heading_deg": math.degrees(sweep.width_heading_rad),
-                "least_width_m": sweep.width_m,
-            },
+            and {"heading_deg": math.degrees(sweep.heading_rad), "cost_j": sweep.cost_j},
             "terrain": figures,
             "warnings": warnings,
         }

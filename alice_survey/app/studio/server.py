@@ -92,7 +92,8 @@ _LOCKED = {
     "X-Frame-Options": "DENY",
 }
 _TOKEN, _NEWEST_OF = "X-Studio-Token", "X-Studio-Newest-Of"
-"""Headers: the token, and a name of the page that asks."""
+"""Headers: the token, and the page that asks with the number of its request."""
+_OLDER = "a newer request of the same page is answered"
 _NEEDS_TOKEN = "this needs the address with its token, as the command printed it"  # noqa: S105 (a line)
 _MAX_STREAMS = 100
 """Pages that listen for events."""
@@ -188,28 +189,42 @@ class _ComputeQueue:
 
     def __init__(self) -> None:
         self._places = asyncio.Semaphore(_COMPUTING)
-        self._waiting: dict[object, asyncio.Future[None]] = {}
+        self._waiting: dict[object, tuple[int, asyncio.Future[None]]] = {}
 
-    async def run(self, page: str, path: str, work: Callable[[], Response]) -> Response:
-        """Do the work of a page in its turn."""
+    async def run(self, newest_of: str, path: str, work: Callable[[], Response]) -> Response:
+        """Do the work of a page in its turn.
+
+        Args:
+            newest_of: a name of the page and the number of its request, since connections do not
+                keep the order in which it asked. Empty: every request is answered.
+            path: that is asked for.
+            work: what answers it.
+        """
+        page, _, digits = newest_of.partition(" ")
+        number = int(digits) if digits.isdecimal() else 0
         key = (page, path) if page else object()
-        if (older := self._waiting.pop(key, None)) is not None:
-            older.set_result(None)
+        waiting, other = self._waiting.get(key, (0, None))
+        if other is not None and waiting > number:
+            return _fault(409, _OLDER)
+        if other is not None:
+            del self._waiting[key]
+            other.set_result(None)
         if len(self._waiting) >= _MAX_WAITING:
             return _fault(503, "the studio computes for other pages: try again in a moment")
-        gives_way = self._waiting[key] = asyncio.get_running_loop().create_future()
+        gives_way: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._waiting[key] = number, gives_way
         turn = asyncio.ensure_future(self._places.acquire())
         try:
             await asyncio.wait(
                 (turn, gives_way), timeout=_WAIT_S, return_when=asyncio.FIRST_COMPLETED
             )
         finally:
-            if self._waiting.get(key) is gives_way:
+            if self._waiting.get(key) == (number, gives_way):
                 del self._waiting[key]
             has_turn = turn.done() or not turn.cancel()
         try:
             if gives_way.done():
-                return _fault(409, "a newer request of the same page is answered")
+                return _fault(409, _OLDER)
             if not has_turn:
                 return _fault(503, "the studio computes for other pages: try again in a moment")
             found = await run_in_threadpool(work)

@@ -56,10 +56,12 @@ export const send = async (path, body = {}, params = {}) => (
 
 /* Send what stops an older request of this page to the same path: only the newest is of use. */
 const onTheirWay = {};
+let requests = 0;
 export async function sendNewest(path, body) {
   onTheirWay[path]?.abort();
   const {signal} = onTheirWay[path] = new AbortController();
-  return (await asked(path, {...posted(body, {"X-Studio-Newest-Of": PAGE}), signal})).json();
+  const options = posted(body, {"X-Studio-Newest-Of": `${PAGE} ${++requests}`});
+  return (await asked(path, {...options, signal})).json();
 }
 
 /* Save a file that the server makes. */
@@ -79,10 +81,9 @@ export function on(name, listener) {
 
 /* An element: el("button", {type: "button", class: "primary", onclick: fn, disabled: true},
    "Save"). Children are elements, texts, or lists of them; null and false are left out. */
+const SVG = new Set("svg path line polyline polygon circle rect g text".split(" "));
 export function el(tag, attributes = {}, ...children) {
-  const svg = ["svg", "path", "line", "polyline", "polygon", "circle", "rect", "g",
-    "text"].includes(tag);
-  const made = svg
+  const made = SVG.has(tag)
     ? document.createElementNS("http://www.w3.org/2000/svg", tag) : document.createElement(tag);
   Object.entries(attributes || {}).forEach(([name, value]) => {
     if (value === null || value === undefined || value === false) return;
@@ -102,8 +103,7 @@ export const button = (text, onclick, attributes = {}) =>
 /* A labelled control: field("Altitude", el("input", {type: "number"}), "m over the floor"). */
 let fields = 0;
 export function field(label, control, hint) {
-  fields += 1;
-  control.id = control.id || "field-" + fields;
+  control.id ||= "field-" + ++fields;
   const about = hint ? el("small", {id: control.id + "-hint"}, hint) : null;
   if (about) control.setAttribute("aria-describedby", about.id);
   return el("div", {class: "field"}, el("label", {for: control.id}, label), control, about);

@@ -86,8 +86,9 @@ def test_computing_waits_in_a_queue_of_its_own(server: Server, go_on: threading.
         until(lambda: len(began) == 2)
         ones = []
         for n in range(2, 6):
-            ones.append(pool.submit(compute, n, "one"))
+            ones.append(pool.submit(compute, n, f"one {n}"))
             until(lambda: sum(one.done() for one in ones) == len(ones) - 1)
+        assert compute(4, "one 4").status == 409, "it was asked before the one that waits"
         others = [pool.submit(compute, n) for n in range(6, 46)]
         until(lambda: sum(one.done() for one in others) >= 25)
         assert ask(server, "/files/dense/dem.tif").status == 200
