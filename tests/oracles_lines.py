@@ -17,9 +17,10 @@ from alice_survey.core.frames import Array, Datum
 from missions.lines.lay import LineTask, lay_lines
 from missions.route.ways import Ways
 from missions.values.area import Area, multipolygon
-from missions.values.costs import Costs, power_at, time_costs
+from missions.values.costs import Costs, power_at
 from missions.values.line import Line
 from missions.values.pattern import Pattern
+from tests.oracles_route import time_costs
 
 DATUM = Datum(latitude_deg=32.8236, longitude_deg=34.9553)
 STEREO = Pattern(spacing_m=1.0, step_m=0.47, half_across_m=0.6, half_along_m=0.57)

@@ -12,11 +12,30 @@ from scipy.sparse.csgraph import dijkstra
 from shapely.geometry import LineString, MultiPolygon
 
 from alice_survey.core.frames import Array
+from alice_survey.sim.vehicle.pilot.settings import STEP_MPS, TURN_IN_PLACE_RAD_S
 from missions.route.turns import Manoeuvre, Turns, legs_through, line_table, route_of
 from missions.route.ways import OPEN_WATER, Ways
-from missions.values.costs import Costs, leg_costs, power_at, time_costs
+from missions.values.costs import SETTLE_S, Costs, leg_costs, power_at
 from missions.values.legs import Leg, Route
 from missions.values.line import Line
+
+
+def time_costs(speed_mps: float) -> Costs:
+    """Costs of 1 W whatever the vehicle does: joules are seconds."""
+    return Costs(
+        speed_mps=speed_mps,
+        line_w=np.ones(4),
+        way_w=np.ones(4),
+        stop_w=1.0,
+        arc_extra_w=0.0,
+        turn_rate_rad_s=TURN_IN_PLACE_RAD_S,
+        settle_s=SETTLE_S,
+        sway_mps=STEP_MPS,
+        sway_w=np.ones(4),
+        heave_mps=0.15,
+        heave_w=1.0,
+    )
+
 
 PAPER_COSTS = time_costs(0.2)  # Gutnik et al. 2021, section VII.A
 

@@ -40,7 +40,6 @@ electrons, and blurs; only what stays within the pixel's own cone is detail.
 
 import math
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
@@ -48,8 +47,6 @@ from alice_survey.core.config import CameraConfig, ImagingConfig
 from alice_survey.core.frames import Array
 from camera_calib.rig import Rig
 from camera_calib.water import ASYMMETRY, WAVELENGTH_NM, WaterOptics, phase_per_sr
-
-Spectrum = Literal["led", "even"]
 
 FLOOR_REFLECTANCE = np.array([0.40, 0.345, 0.255])
 """Red, green and blue of bare sand, as `alice_survey.sim.seafloor.texture.SAND_ALBEDO`."""
@@ -107,19 +104,14 @@ def share_within(angle_rad: float) -> float:
     return (1.0 - g * g) / (2.0 * g) * (far - (1.0 - g)) / (far * (1.0 - g))
 
 
-def watts_per_lumen(spectrum: Spectrum) -> Array:
-    """Radiant watts in red, green and blue for one lumen, (3,).
+def watts_per_lumen() -> Array:
+    """Radiant watts of an LED in red, green and blue for one lumen, (3,).
 
     Lumens are `683 integral(P V)`, with the CIE photopic curve as V = 1.019 exp(-285.4 (um -
     0.559)^2), which holds its integral to 0.1 %.
-
-    Args:
-        spectrum: of the LED, or even between 400 and 700 nm.
     """
     nm = np.linspace(380.0, 780.0, 801)
     power = np.interp(nm, LED_NM, LED_B3)
-    if spectrum == "even":
-        power = np.where((nm >= 400.0) & (nm <= 700.0), 1.0, 0.0)
     photopic = 1.019 * np.exp(-285.4 * (nm * 1e-3 - 0.559) ** 2)
     lumens = _LUMENS_PER_WATT * np.trapezoid(power * photopic, nm)
     bands = [(nm >= low) & (nm <= high) for low, high in _BANDS_NM]
@@ -168,12 +160,7 @@ class FloorRadiance:
 
 
 def floor_radiance(
-    rig: Rig,
-    imaging: ImagingConfig,
-    water: WaterOptics,
-    altitude_m: float,
-    pixels: Array,
-    spectrum: Spectrum = "led",
+    rig: Rig, imaging: ImagingConfig, water: WaterOptics, altitude_m: float, pixels: Array
 ) -> FloorRadiance:
     """Light that level sand sends to the reference camera.
 
@@ -185,7 +172,6 @@ def floor_radiance(
         water: of the three channels.
         altitude_m: of the outer glass.
         pixels: (..., 2).
-        spectrum: of the strobes.
     """
     camera = rig.cameras[rig.reference]
     floor_z = float(camera.front_cam[2]) + altitude_m
@@ -193,7 +179,7 @@ def floor_radiance(
     path = (floor_z - outer[..., 2]) / directions[..., 2]
     points = outer + path[..., None] * directions
     down = rig.body_from_cam(rig.reference).inv().rotation.apply([0.0, 0.0, 1.0])
-    power = imaging.strobe_lumens * watts_per_lumen(spectrum)
+    power = imaging.strobe_lumens * watts_per_lumen()
     half_beam = math.radians(imaging.strobe_beam_deg) / 2
     irradiance = np.zeros((*path.shape, 3))
     for strobe in _strobes_cam(rig, imaging):
@@ -369,7 +355,6 @@ def veil_radiance(
     water: WaterOptics,
     altitude_m: float,
     attenuation_per_m: Array,
-    spectrum: Spectrum = "led",
 ) -> Array:
     """Radiance (3,) that water throws back along the axis of the reference camera, W / (m^2 sr).
 
@@ -382,7 +367,6 @@ def veil_radiance(
         water: of the three channels.
         altitude_m: of the outer glass.
         attenuation_per_m: (3,) of light to and from the water.
-        spectrum: of the strobes.
     """
     half_beam = math.radians(imaging.strobe_beam_deg) / 2
     path = _axis_paths(altitude_m)
@@ -395,7 +379,7 @@ def veil_radiance(
         cos_beam = away[:, 2] / distance
         turned = cone_intensity(cos_beam, half_beam) / distance**2 * phase_per_sr(-cos_beam)
         sent += turned[:, None] * np.exp(-(distance + path)[:, None] * attenuation_per_m)
-    power = imaging.strobe_lumens * watts_per_lumen(spectrum)
+    power = imaging.strobe_lumens * watts_per_lumen()
     return np.trapezoid(sent, path, axis=0) * power * water.scattering_per_m
 
 

@@ -8,7 +8,6 @@ import numpy as np
 
 from alice_survey.core.errors import PlanError
 from alice_survey.core.frames import Array
-from alice_survey.sim.vehicle.pilot.settings import STEP_MPS, TURN_IN_PLACE_RAD_S
 from missions.values.legs import Route
 
 SETTLE_S = 6.5
@@ -68,23 +67,6 @@ class Costs(NamedTuple):
     def dive_s(self, depth_m: float) -> float:
         """Time of going down to a depth and up again."""
         return 2.0 * depth_m / self.heave_mps
-
-
-def time_costs(speed_mps: float) -> Costs:
-    """Costs of 1 W whatever the vehicle does: joules are seconds."""
-    return Costs(
-        speed_mps=speed_mps,
-        line_w=np.ones(4),
-        way_w=np.ones(4),
-        stop_w=1.0,
-        arc_extra_w=0.0,
-        turn_rate_rad_s=TURN_IN_PLACE_RAD_S,
-        settle_s=SETTLE_S,
-        sway_mps=STEP_MPS,
-        sway_w=np.ones(4),
-        heave_mps=0.15,
-        heave_w=1.0,
-    )
 
 
 def power_at(power_w: Array, course_rad: Array | float) -> Array:

@@ -43,8 +43,12 @@ CLEAR = WaterOptics(absorption_per_m=np.zeros(3), scattering_per_m=np.zeros(3))
 
 @pytest.mark.parametrize("jerlov", ["I", "II", "3C", "7C"])
 @pytest.mark.parametrize("altitude_m", [1.5, 2.0, 3.0])
-def test_the_budget_agrees_with_a_rendered_flat_floor(jerlov: str, altitude_m: float) -> None:
+def test_the_budget_agrees_with_a_rendered_flat_floor(
+    jerlov: str, altitude_m: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The simulator has an even spectrum, a soft cone, and of scattered light only the veil."""
+    monkeypatch.setattr("missions.exposure.light.LED_NM", np.array([399.99, 400, 700, 700.01]))
+    monkeypatch.setattr("missions.exposure.light.LED_B3", np.array([0.0, 1.0, 1.0, 0.0]))
     rig, config = survey(water={"jerlov": jerlov})
     camera, optics = rig.cameras["left"], water_optics(config.water.jerlov)
     light = camera_light(
@@ -56,7 +60,7 @@ def test_the_budget_agrees_with_a_rendered_flat_floor(jerlov: str, altitude_m: f
     veil = flat_floor_radiance(camera, light, range_m, np.zeros(3), step)
     pixels = camera.pixel_centres(step)
     lossy = WaterOptics(absorption_per_m=optics.attenuation_per_m, scattering_per_m=np.zeros(3))
-    ours = floor_radiance(rig, config.imaging, lossy, altitude_m, pixels, "even").total
+    ours = floor_radiance(rig, config.imaging, lossy, altitude_m, pixels).total
     ours *= lens_falloff(rig, pixels)[..., None]
 
     np.testing.assert_array_equal(FLOOR_REFLECTANCE, SAND_ALBEDO)
@@ -67,7 +71,7 @@ def test_the_budget_agrees_with_a_rendered_flat_floor(jerlov: str, altitude_m: f
 
     middle = (rendered.shape[0] // 2, rendered.shape[1] // 2)
     lost = optics.attenuation_per_m
-    mine = veil_radiance(rig, config.imaging, optics, altitude_m, lost, "even")
+    mine = veil_radiance(rig, config.imaging, optics, altitude_m, lost)
     np.testing.assert_allclose(mine, veil[middle], rtol=0.15)
 
 
@@ -95,7 +99,7 @@ def test_the_led_has_the_colour_that_cie_states() -> None:
     z = 1.217 * lobe(nm, 437.0, 11.8, 36.0) + 0.681 * lobe(nm, 459.0, 26.0, 13.8)
     xyz = np.array([power @ x, power @ y, power @ z])
     np.testing.assert_allclose(xyz[:2] / xyz.sum(), [0.3756, 0.3723], atol=0.004)
-    watts = watts_per_lumen("led")
+    watts = watts_per_lumen()
     assert 683.0 * (power @ y) / power.sum() == pytest.approx(1 / watts.sum(), rel=0.03)
     red, green, blue = watts
     assert green > red > blue
@@ -118,7 +122,7 @@ def test_one_strobe_over_the_camera_in_clear_water_is_the_closed_form() -> None:
     centre = np.array([camera.cx_px, camera.cy_px])
     radiance = floor_radiance(rig, config.imaging, CLEAR, 2.0, centre)
     np.testing.assert_array_equal(radiance.total, radiance.sharp)
-    power = 30_000 * watts_per_lumen("led")
+    power = 30_000 * watts_per_lumen()
     expected = FLOOR_REFLECTANCE / math.pi * power / (math.pi * math.sin(math.radians(60)) ** 2) / 4
     np.testing.assert_allclose(radiance.total, expected, rtol=1e-9)
 
@@ -314,7 +318,7 @@ def test_photons_make_the_veil_that_the_budget_says(jerlov: Jerlov, within: floa
         by_turn.append(got)
         d[flying] = turned(d[flying], rng)
 
-    watts = config.imaging.strobe_lumens * float(watts_per_lumen("led")[GREEN])
+    watts = config.imaging.strobe_lumens * float(watts_per_lumen()[GREEN])
     lost, forward = water.attenuation_per_m, weakened_per_m(water, LIT_SHARE)
     once, kept = (
         float(veil_radiance(rig, config.imaging, water, altitude_m, k)[GREEN]) / watts

@@ -12,11 +12,11 @@ from alice_survey.core.errors import PlanError
 from missions.lines.hops import comparable, hop_j
 from missions.lines.lay import lay_lines, lay_pattern, order_lines, stops
 from missions.route.ways import Ways
-from missions.values.costs import Costs, time_costs
+from missions.values.costs import Costs
 from missions.values.line import Line
 from missions.values.pattern import Pattern
 from tests import oracles_lines
-from tests.oracles_route import way_m
+from tests.oracles_route import time_costs, way_m
 
 COURSES = np.arange(16) * 2 * np.pi / 16
 CURRENT = time_costs(0.2)._replace(

@@ -10,8 +10,9 @@ from alice_survey.core.errors import PlanError
 from missions.lines.lay import lay_pattern
 from missions.lines.sweep import best_heading, min_width, widths_m
 from missions.route.ways import edges_of
-from missions.values.costs import Costs, time_costs
+from missions.values.costs import Costs
 from tests.oracles_lines import ELL, ELL_WITH_HOLES, area_of, areas, line_task
+from tests.oracles_route import time_costs
 
 ALONG = np.arange(16) * 2 * np.pi / 16
 CALM = time_costs(0.2)

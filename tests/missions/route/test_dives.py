@@ -15,11 +15,11 @@ from missions.route.dives import DEAREST_TIE, split_dives
 from missions.route.turns import Manoeuvre, legs_alone, line_table, route_of
 from missions.route.ways import Ways
 from missions.values.area import multipolygon
-from missions.values.costs import Costs, time_costs
+from missions.values.costs import Costs
 from missions.values.line import Line
 from missions.values.plan_file import Dive
 from tests.oracles_energy import best_parting
-from tests.oracles_route import inside, lawn, route_cost, route_through
+from tests.oracles_route import inside, lawn, route_cost, route_through, time_costs
 
 HOME = (-2.0, -1.0)
 WAYS = Ways(shapely.MultiPolygon([shapely.box(-6, -6, 60, 40)]))

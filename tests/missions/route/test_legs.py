@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from pydantic import TypeAdapter
 
 from missions.route.turns import COLUMNS, prices_j
-from missions.values.costs import Costs, leg_costs, mean_power, time_costs
+from missions.values.costs import Costs, leg_costs, mean_power
 from missions.values.legs import Leg, Route
-from tests.oracles_route import route_cost, route_cost_by_steps, sampled_leg
+from tests.oracles_route import route_cost, route_cost_by_steps, sampled_leg, time_costs
 
 angles = st.floats(-7.0, 7.0)
 lengths = st.floats(0.01, 30.0)

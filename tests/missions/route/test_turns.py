@@ -12,7 +12,7 @@ from alice_survey.core.errors import PlanError
 from missions.route.turns import MAX_SWAY_M, Turns, ends_of, turns_inside
 from missions.route.ways import OPEN_WATER, TOUCH_M, Place, Ways
 from missions.values.area import multipolygon
-from missions.values.costs import SETTLE_S, time_costs
+from missions.values.costs import SETTLE_S
 from missions.values.legs import Leg, Route
 from missions.values.line import Line
 from tests.oracles_route import (
@@ -22,6 +22,7 @@ from tests.oracles_route import (
     line_starts_m,
     route_cost,
     route_through,
+    time_costs,
     turn_counts,
     way_m,
 )
