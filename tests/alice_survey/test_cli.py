@@ -19,6 +19,7 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 from alice_survey.app.cli.main import GROUPS, app, main
+from alice_survey.app.commands import COMMANDS
 from alice_survey.app.pipeline import init_survey
 from alice_survey.app.stages import names
 from alice_survey.core.config import CameraConfig, WaterConfig, load_config
@@ -69,6 +70,18 @@ def test_every_command_explains_itself_with_examples(path: tuple[str, ...]) -> N
         parser = parser.commands[name]
     for example in examples:
         parser.make_context(path[-1], example[len(path) :])  # it parses
+
+
+def test_what_few_need_comes_last_in_help() -> None:
+    for kind in COMMANDS:
+        rare = set(kind.advanced.split())
+        assert rare <= kind.model_fields.keys(), kind.name
+        shown = CliRunner().invoke(app, [*kind.name.split(), "--help"]).output
+        first, _, last = shown.partition("\nAdvanced:\n")
+        for name in rare | {"quiet", "log_file"}:
+            row = f"  {kind.option_name(name)} "
+            assert row not in first
+            assert row in last or f", {row.strip()} " in last
 
 
 def examples_of(*path: str) -> list[list[str]]:

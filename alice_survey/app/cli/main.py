@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 import typer
 from pydantic import ValidationError
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 from alice_survey.app.commands import COMMANDS
 from alice_survey.app.commands.base import CommandModel, WorkspaceCommand, option
@@ -23,6 +23,8 @@ CONTEXT = {"help_option_names": ["-h", "--help"]}
 _SHARED = ("workspace", "survey", "threads", "scheduler", "cluster", "device", "as_json", "quiet",
            "log_file")  # fmt: skip
 """Fields that come last in the help."""
+_ADVANCED = _SHARED[2:6] + _SHARED[7:]
+"""Of these, and of a command's `advanced`, the help tells under a heading of their own."""
 _VEHICLE = "The vehicle: coefficients from geometry and from logs, and how its two forms compare."
 """Help of the group of commands that is no command itself."""
 GROUPS = {
@@ -85,6 +87,23 @@ class StudioCommand(WorkspaceCommand):
         run_studio(self.workspace, self.port, browser=self.browser, show=typer.echo, log=self.log)
 
 
+def _format_options(command: Any, ctx: Any, formatter: Any) -> None:
+    """Write arguments and options of a command's help, the rare ones last."""
+    sections: dict[str, list[Any]] = {"Arguments": [], "Options": [], "Advanced": []}
+    for one in command.get_params(ctx):
+        title = "Arguments" if one.param_type_name == "argument" else "Options"
+        title = "Advanced" if one.name in command.callback.advanced else title
+        sections[title].append(one.get_help_record(ctx))
+    for title, rows in sections.items():
+        if rows:
+            with formatter.section(title):
+                formatter.write_dl(rows)
+
+
+class _Sectioned(TyperCommand):
+    format_options = _format_options
+
+
 class _Grouped(TyperGroup):
     """Commands below the headings of `GROUPS`."""
 
@@ -97,8 +116,17 @@ class _Grouped(TyperGroup):
                 formatter.write_dl([(n, one.get_short_help_str(width)) for n, one in rows])
 
 
-class _WithFolder(TyperGroup):
-    """A command that has others below it, and takes a folder as they do."""
+class _Parent(TyperGroup):
+    """A command that has others below it."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write its options, and the commands below it."""
+        _format_options(self, ctx, formatter)
+        self.format_commands(ctx, formatter)
+
+
+class _WithFolder(_Parent):
+    """One that takes a folder as those below it do."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the arguments."""
@@ -127,7 +155,7 @@ def make_app(commands: Sequence[type[CommandModel]] = (*COMMANDS, StudioCommand)
         parents[name] = typer.Typer(
             help=None if alone else _VEHICLE, invoke_without_command=alone,
             no_args_is_help=not alone, context_settings=CONTEXT, rich_markup_mode=None,
-            cls=_WithFolder if in_folder else None,
+            cls=_WithFolder if in_folder else _Parent if alone else None,
         )  # fmt: skip
     for command in commands:
         group, _, name = command.name.rpartition(" ")
@@ -140,7 +168,7 @@ def make_app(commands: Sequence[type[CommandModel]] = (*COMMANDS, StudioCommand)
             parents[command.name].callback()(_callback(command, is_group=True))
             app.add_typer(parents[command.name], name=command.name, **about)
         else:
-            parents[group].command(name, **about)(_callback(command))
+            parents[group].command(name, cls=_Sectioned, **about)(_callback(command))
     for name in parents.keys() - names - {""}:
         app.add_typer(parents[name], name=name)
     return app
@@ -188,6 +216,7 @@ def _callback(kind: type[CommandModel], *, is_group: bool = False) -> Callable[.
         info = typer.Argument(metavar="WORKSPACE", help="The same as -w.", show_default=False)
         parameters.append(_parameter("folder", Annotated[Path | None, info], None))
     vars(call)["__signature__"] = inspect.Signature(parameters)
+    vars(call)["advanced"] = (*kind.advanced.split(), *_ADVANCED)
     call.__annotations__ = {one.name: one.annotation for one in parameters}
     return call
 

@@ -57,6 +57,8 @@ class CommandModel(BaseModel):
     """Its words on the command line."""
     examples: ClassVar[Sequence[str]] = ()
     """Arguments to show in its help, after the program's name."""
+    advanced: ClassVar[str] = ""
+    """Fields that few need: the help tells of them last."""
     title: ClassVar[str] = ""
     """What it does, in words; only where the studio offers it."""
     offered: ClassVar[Sequence[str]] = ()

@@ -34,6 +34,7 @@ class ConvertCommand(ReportCommand):
     """
 
     name = "camera convert"
+    advanced = "unit_m names dome_centre n_glass water mount lever drop_covariance"
     examples = (
         "camera convert rig.json cameras.xml --drop-port --drop-covariance",
         "camera convert rig.json model --to colmap --water 1.5 3 --drop-covariance",

@@ -310,6 +310,7 @@ class IdentifyCommand(ReportCommand):
     """
 
     name = "vehicle identify"
+    advanced = "held method columns given window prior"
     examples = (
         "vehicle identify surge.csv turns.csv --free X_uu,Y_vv,N_rr,N_rdot,current -o found",
         "vehicle identify dive.csv --validate second.csv --bollard pull.csv --method two-step",
@@ -378,6 +379,7 @@ class PilotCommand(SurveyCommand):
     """
 
     name = "pilot"
+    advanced = "frame body_frame altimeter grace odometry_age edited takes rate track"
     examples = (
         "pilot -w reef",
         "pilot -w reef --odometry /auv/odom --altitude /auv/altimeter --record dive.csv",

@@ -26,6 +26,7 @@ class ImportImagesCommand(WorkspaceCommand, ThreadsCommand):
     """
 
     name = "import-images"
+    advanced = "recursive time_zone vertical_datum triggers split"
     examples = (
         "import-images photos -w reef",
         "import-images --left cam1 --right cam2 --triggers triggers.csv -w reef",
@@ -169,6 +170,7 @@ class ImportLogCommand(ReportCommand):
     """
 
     name = "import-log"
+    advanced = "topic datum altitude_offset start_at heading_sigma flip_velocity"
     examples = (
         "import-log sparus2.bag -o navigation.csv",
         "import-log 00000042.BIN --declination 3.4 --tide tides.csv -o navigation.csv",

@@ -211,6 +211,7 @@ class CalibrateCommand(SurveyCommand, ThreadsCommand):
     """
 
     name = "calibrate"
+    advanced = "intrinsics n_glass n_water mount lever"
     examples = (
         "calibrate -w reef",
         "calibrate --left 'left*.jpg' --right 'right*.jpg' --target 'chessboard 9x6 25mm' -o air",
@@ -250,10 +251,10 @@ class CalibrateCommand(SurveyCommand, ThreadsCommand):
     dome_radius: str | None = option(None, "Outer radius of a dome, mm, and others: 80,bow=60.")
     port_distance: str | None = option(None, "Pupil to glass, first value, mm: 20, or 20,tele=45.")
     glass: str | None = option(
-        None, "Thickness of the port, mm: 6, or 6,bow=5. With a sigma, 6+-0.1, this and the next "
-        "ones are found too.",
+        None, "Thickness of the port, mm: 6, or 6,bow=5. With a sigma, 6+-0.1, it and both "
+        "indices are found too.",
     )  # fmt: skip
-    n_glass: str | None = option(None, "Its index, 1.52 if not given: 1.49, or 1.52,bow=1.49.")
+    n_glass: str | None = option(None, "Index of the glass, 1.52 if not given; or 1.52,bow=1.49.")
     n_water: str | None = option(None, "Index of the water, 1.34 if not given; or 1.34+-0.002.")
     mount: str | None = option(
         None, "On the vehicle: nadir-bow-up, forward+30 and others, or a file."
