@@ -234,8 +234,6 @@ class AcceptanceRecord(JsonRecord):
     notes: Notes = ()
     checked: int = 0
     """Stations with a position."""
-    usual_m: float | None = None
-    """Usual distance from navigation, one standard deviation by axis, robustly."""
     far: tuple[FarStation, ...] = ()
     """Stations off navigation, the farthest first."""
     rig_error: float | None = None

@@ -49,14 +49,14 @@ def map_data(survey_map: SurveyMap) -> tuple[str, list[tuple[str, str]]]:
 
 
 def map_extent(survey_map: SurveyMap) -> tuple[float, float, float, float]:
-    """West, south, east and north limits of the map's contents, on its own axes.
+    """West, south, east and north limits of what is shown at first, on the map's own axes.
 
     Raises:
         ValueError: nothing is on the map.
     """
     east: list[float] = []
     north: list[float] = []
-    for layer in survey_map.layers:
+    for layer in [one for one in survey_map.layers if one.shown] or survey_map.layers:
         if isinstance(layer, PictureLayer):
             east += [layer.west_m, layer.west_m + layer.width_px * layer.pixel_m]
             north += [layer.north_m, layer.north_m - layer.height_px * layer.pixel_m]

@@ -8,14 +8,19 @@ _SIGMA_DIGITS = 2
 _UNITS = ("mm", "m", "px", "deg", "ppm", "l")
 
 
-def length(metres: float | None, unit: str = "m") -> str:
-    """`0.364 mm`, `2.4 cm`, `41 m`; in units of the model where it has no scale."""
+def length(metres: float | None, unit: str = "m", significant: int = 3) -> str:
+    """`0.364 mm`, `2.40 cm`, `41.0 m`; in units of the model where it has no scale."""
     if metres is None or not math.isfinite(metres):
         return "unknown"
     if unit != "m":
-        return f"{metres:.3g} {unit}"
+        return f"{metres:.{significant}g} {unit}"
     factor, name = _length_unit(metres)
-    return f"{digits(factor * metres)} {name}"
+    return f"{digits(factor * metres, significant)} {name}"
+
+
+def sigma_length(metres: float | None, unit: str = "m") -> str:
+    """As `length`, with the two digits that a sigma has."""
+    return length(metres, unit, _SIGMA_DIGITS)
 
 
 def length_with_sigma(metres: float, sigma_m: float) -> str:

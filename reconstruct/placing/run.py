@@ -460,7 +460,6 @@ def check_mapping(
     return AcceptanceRecord(
         notes=tuple(notes),
         checked=len(numbers),
-        usual_m=usual if np.isfinite(usual) else None,
         far=tuple(far),
         rig_error=rig_error if np.isfinite(rig_error) else None,
     )

@@ -39,6 +39,7 @@ from alice_survey.kit.words import (
     parts,
     parts_with_sigma,
     share,
+    sigma_length,
 )
 from camera_calib.camera import camera_from_json
 from camera_calib.mount import mount_line
@@ -196,7 +197,7 @@ def _surface(held: Held) -> Section:
             f"{moving.masked_share:.2%} of the area of all; mask_moving = false keeps them"
         )
     rows = [
-        ("share of a height's sigma that is the cameras'", length(found.pose_sigma, held.unit)),
+        ("a height's sigma from the cameras alone", sigma_length(found.pose_sigma, held.unit)),
         ("sigma of a match", f"{digits(found.match_sigma_px, 2)} px"),
         ("heights count from", found.vertical_datum),
         ("masked since it moves", masked),
@@ -277,7 +278,8 @@ def _model(held: Held, found: RegistrationRecord) -> Section:
         rows.append(("scale by what each station sees alone", own))
     if place is not None:
         for axis in ("north", "east", "depth"):
-            rms, sigma = (length(getattr(place, f"{kind}_{axis}_m")) for kind in ("rms", "sigma"))
+            sizes = (getattr(place, f"{kind}_{axis}_m") for kind in ("rms", "sigma"))
+            rms, sigma = map(sigma_length, sizes)
             rows.append((f"navigation {axis}", f"residuals {rms} rms, sigma of the survey {sigma}"))
         turns = (place.sigma_heading_deg, place.sigma_tilt_deg)
         heading, tilt = ("unknown" if t is None else f"{digits(t, 2)} deg" for t in turns)

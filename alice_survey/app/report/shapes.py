@@ -10,7 +10,7 @@ from alice_survey.core.artefacts import read_json
 from alice_survey.core.frames import Array, Datum
 from alice_survey.core.records import FrameRecord
 from alice_survey.kit.document import ShapeLayer
-from alice_survey.kit.words import length
+from alice_survey.kit.words import sigma_length
 from reconstruct.views.model import datum_of
 
 _BLUE, _ORANGE, _GREEN, _RED, _BLACK = "#0072b2", "#e69f00", "#009e73", "#d55e00", "#333333"
@@ -49,11 +49,11 @@ def shape_layers(held: Held) -> Iterator[ShapeLayer]:
         _layer("footprints", "Footprints", "Surface that each picture shows.", "polygon",
                list(_footprints(held)), colour=_GREEN, shown=False),
         _layer("plan", "Plan", "Survey lines as planned.", "line", planned, colour=_BLUE,
-               dashed=True),
+               dashed=True, shown=not held.has("mosaic")),
         _layer("flown", "Flown", "Where the vehicle really was (simulated).", "line", flown,
-               colour=_ORANGE),
+               colour=_ORANGE, shown=not held.has("mosaic")),
         _layer("cameras", "Cameras", "Where pictures were taken, from the model.", "point",
-               _cameras(held), colour=_BLUE, shown=not track),
+               _cameras(held), colour=_BLUE, shown=not track and not held.has("mosaic")),
         _layer("lost", "Lost pictures",
                "Pictures that are not in the model, where navigation has them.", "point",
                _lost_pictures(held), colour=_RED),
@@ -98,7 +98,7 @@ def _cameras(held: Held) -> list[tuple[Shape, str]]:
         sigma = np.hypot(number(row, "sigma_north_m"), number(row, "sigma_east_m"))
         text = (
             f"{row['image']}: {row['points']} points, {number(row, 'reprojection_px'):.2f} px; "
-            f"sigma {length(float(sigma), held.unit)} level"
+            f"sigma {sigma_length(float(sigma), held.unit)} level"
         )
         found.append((_pairs(place), text))
     return found

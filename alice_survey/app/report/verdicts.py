@@ -28,6 +28,7 @@ from alice_survey.kit.words import (
     parts,
     parts_with_sigma,
     share,
+    sigma_length,
 )
 
 _SURE_SIGMAS = 3.0
@@ -111,7 +112,7 @@ def _model(held: Held) -> Iterator[Verdict]:
         away = math.hypot(joint.sigma_north_m, joint.sigma_east_m, joint.sigma_depth_m)
         yield _verdict(
             f"{count(joint.stations, 'station')} show nothing that the others show: navigation "
-            f"alone places them relative to these, with a sigma of {length(away)}",
+            f"alone places them relative to these, with a sigma of {sigma_length(away)}",
             "Fly a line across the gap to join the parts as well as their pictures can.",
         )
     doming, acceptance = found.doming, found.acceptance
@@ -204,8 +205,9 @@ def _truth(held: Held) -> Iterator[Verdict]:
         yield _verdict(
             f"errors of heights over their stated sigmas: {over.rms:.2f} rms (1 is expected), "
             f"{lean:+.2f} in the median",
-            "Multiply the stated sigmas by this factor where it matters; a median off zero is an "
-            "error that heights share, which control points find.",
+            "Measure control points: heights share an error."
+            if abs(lean) > _MAX_LEAN
+            else f"Multiply the stated sigmas by {over.rms:.1f} where it matters.",
             good=_HONEST[0] <= over.rms <= _HONEST[1] and abs(lean) <= _MAX_LEAN,
         )
 
@@ -297,12 +299,10 @@ def _quality(held: Held) -> str:
         return "No surface to judge yet."
     clauses = []
     if math.isfinite(surface.sigma_median):
-        clauses.append(
-            f"Heights within the survey are accurate to {length(surface.sigma_median, unit)} (1 "
-            f"sigma; 95 % of the cells to {length(surface.sigma_95, unit)})"
-        )
+        usual, most = (sigma_length(s, unit) for s in (surface.sigma_median, surface.sigma_95))
+        clauses.append(f"Heights are accurate to {usual} (1 sigma; 95 % of the cells to {most})")
     if math.isfinite(held.place_sigma_m):
-        clauses.append(f"its place on the Earth to {length(held.place_sigma_m, unit)}")
+        clauses.append(f"its place on the Earth to {sigma_length(held.place_sigma_m, unit)}")
     return ", ".join(clauses) + "." if clauses else "The model states no sigma."
 
 
