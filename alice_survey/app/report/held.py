@@ -87,10 +87,12 @@ class Held:
 
     @cached_property
     def frame(self) -> FrameRecord:
-        """Frame of the model's coordinates; as planned before there is one."""
-        return self.read(FrameRecord) or FrameRecord(
-            datum=None if self.plan is None else PlaceRecord(**asdict(self.plan.datum))
-        )
+        """Frame of the model's coordinates; of the plan or the pictures before there is one."""
+        pictures = self.read(PicturesRecord)
+        place = None if pictures is None else pictures.datum
+        if self.plan is not None:
+            place = PlaceRecord(**asdict(self.plan.datum))
+        return self.read(FrameRecord) or FrameRecord(datum=place)
 
     @cached_property
     def plane(self) -> PlaneRecord | None:

@@ -7,8 +7,7 @@ import numpy as np
 
 from alice_survey.app.report.held import Held, number, planned_area
 from alice_survey.core.artefacts import read_json
-from alice_survey.core.frames import Array, Datum
-from alice_survey.core.records import FrameRecord
+from alice_survey.core.frames import Array
 from alice_survey.kit.document import ShapeLayer
 from alice_survey.kit.words import sigma_length
 from reconstruct.views.model import datum_of
@@ -54,9 +53,9 @@ def shape_layers(held: Held) -> Iterator[ShapeLayer]:
                colour=_ORANGE, shown=not held.has("mosaic")),
         _layer("cameras", "Cameras", "Where pictures were taken, from the model.", "point",
                _cameras(held), colour=_BLUE, shown=not track and not held.has("mosaic")),
-        _layer("lost", "Lost pictures",
-               "Pictures that are not in the model, where navigation has them.", "point",
-               _lost_pictures(held), colour=_RED),
+        _layer("lost", "Lost pictures" if held.has("sparse") else "Pictures",
+               "Pictures that are not in a model, where navigation has them.", "point",
+               _lost_pictures(held), colour=_RED if held.has("sparse") else _BLUE),
     )  # fmt: skip
     yield from (layer for layer in made if layer.shapes)
 
@@ -105,8 +104,8 @@ def _cameras(held: Held) -> list[tuple[Shape, str]]:
 
 
 def _lost_pictures(held: Held) -> list[tuple[Shape, str]]:
-    datum = _datum(held)
-    if datum is None or not held.has("sparse"):
+    datum = held.frame.datum
+    if datum is None:
         return []
     there = {row["image"] for row in held.track}
     rows = [row for row in held.rows("images/manifest.csv") if row["image"] not in there]
@@ -114,9 +113,9 @@ def _lost_pictures(held: Held) -> list[tuple[Shape, str]]:
     if not rows:
         return []
     places = np.array([[number(r, "latitude_deg"), number(r, "longitude_deg")] for r in rows])
-    ned = datum.ned_from_geodetic(np.column_stack([places, np.zeros(len(rows))]))
+    ned = datum_of(datum).ned_from_geodetic(np.column_stack([places, np.zeros(len(rows))]))
     return [
-        (_pairs(place[None, 1::-1]), f"{row['image']}: not in the model")
+        (_pairs(place[None, 1::-1]), f"{row['image']}: not in a model")
         for place, row in zip(ned, rows, strict=True)
     ]
 
@@ -125,18 +124,13 @@ def _footprints(held: Held) -> Iterator[tuple[Shape, str]]:
     file = held.file("mosaic/footprints.geojson")
     if file is None:
         return
-    datum = _datum(held)
+    datum = held.frame.datum
     for feature in read_json(file)["features"]:
         facts: dict[str, str] = feature["properties"]
         for ring in (feature["geometry"] or {}).get("coordinates", []):
             corners = np.asarray(ring, dtype=np.float64)
             if datum is not None and held.frame.name == "ned":
                 level = np.column_stack([corners[:, 1::-1], np.zeros(len(corners))])
-                corners = datum.ned_from_geodetic(level)[:, 1::-1]
+                corners = datum_of(datum).ned_from_geodetic(level)[:, 1::-1]
             area = float(next(facts[name] for name in facts if name.startswith("area_")))
             yield _pairs(corners[:, :2]), f"{facts['image']}: {area:.2f} {held.unit}²"
-
-
-def _datum(held: Held) -> Datum | None:
-    frame = held.read(FrameRecord)
-    return None if frame is None or frame.datum is None else datum_of(frame.datum)

@@ -6,7 +6,9 @@ import pytest
 import rasterio
 
 from alice_survey.app.report.held import Held
+from alice_survey.app.report.shapes import shape_layers
 from alice_survey.core.artefacts import write_json
+from alice_survey.core.frames import Datum
 from tests.alice_survey.app.report.tiny import CELL_M, COLUMNS, ROWS, SIGMA_M, SLOPE, tiny_workspace
 
 
@@ -59,3 +61,25 @@ def test_what_is_not_there_is_not_held(tmp_path: Path) -> None:
     held = Held.of(tmp_path / "a")
     assert not held.has("dense")
     assert held.file("dense/dem.tif") is held.surface is None
+
+
+def test_pictures_lie_on_the_map_before_there_is_a_model(tmp_path: Path) -> None:
+    datum = Datum(-33.9, 151.3)
+    north_east = np.array([[0.0, 0.0], [3.0, -4.0]])
+    places = datum.geodetic_from_ned(np.column_stack([north_east, np.zeros(2)]))
+    names = ("cam/a.jpg", "cam/b.jpg", "cam/no_fix.jpg")
+    rows = [
+        f"{name},{lat!r},{lon!r}"
+        for name, (lat, lon, _) in zip(names[:2], places.tolist(), strict=True)
+    ]
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / "manifest.csv").write_text(
+        "\n".join(["image,latitude_deg,longitude_deg", *rows, "cam/no_fix.jpg,,"])
+    )
+    stage = {"stage": "images", "version": 1, "digest": "", "took_s": 1.0}
+    write_json(tmp_path / "images" / "stage.json", stage)
+    place = {"latitude_deg": -33.9, "longitude_deg": 151.3, "height_m": 0.0}
+    write_json(tmp_path / "images" / "survey.json", {"source": "imported", "datum": place})
+    (layer,) = shape_layers(Held.of(tmp_path))
+    assert layer.shown
+    np.testing.assert_allclose([shape[0] for shape in layer.shapes], north_east[:, ::-1], atol=1e-4)
