@@ -35,6 +35,10 @@ _SHARED = {
     "--workspace", "-w", "-s", "--survey", "--threads", "--scheduler", "--cluster", "--device",
     "--json", "-q", "--quiet", "--log-file", "WORKSPACE",
 }  # fmt: skip
+_PARTS = re.compile(
+    r'(<nav class="md-nav"[^>]*)aria-labelledby="__nav_\w+"'
+    r"([^>]*>\s*<label[^>]*>\s*<span[^>]*></span>([^<]+)</label>)"
+)
 _TIGHT_BAR = r'<mo stretchy="false" lspace="0" rspace="0">\1</mo>'
 
 
@@ -43,6 +47,15 @@ def on_page_content(content: str, *, page: Page, config: MkDocsConfig, files: Fi
     where = page.file.src_uri
     content = _BLOCK.sub(lambda found: _block(found[1], where), content)
     return _INLINE.sub(lambda found: mathml(found[1], "inline", where), content)
+
+
+def on_post_page(output: str, *, page: Page, config: MkDocsConfig) -> str:
+    """Name what the theme leaves without a name, for readers of screens."""
+    output = output.replace('role="dialog"', 'role="dialog" aria-label="Search"')
+    output = _PARTS.sub(
+        lambda found: f'{found[1]}aria-label="{found[3].strip()}"{found[2]}', output
+    )
+    return output.replace("<th></th>", "<td></td>")
 
 
 def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: Files) -> str:

@@ -14,7 +14,7 @@ import yaml
 
 import alice_survey as alice
 from tests import structure
-from tests.alice_survey.kit.browser import Heard, chromium
+from tests.alice_survey.kit.browser import Heard, chromium, is_accessible
 from tests.docs.pages import DOCS, pages
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("site")]
@@ -130,6 +130,8 @@ def test_pages_open_from_disk_and_ask_for_nothing_else(site: Path, browser: Any)
     for page in held:
         tab.goto(page.as_uri())
         assert tab.evaluate("document.documentElement.scrollWidth") <= 400, page
+        if page.stem in ("index", "tutorial", "paper-optics", "models", "placing", "demo"):
+            is_accessible(tab)
         assert page.stat().st_size <= 300_000, page
         is_made = page.parent.name in ("api", "commands") or page.stem == "settings"
         height = tab.evaluate("document.documentElement.scrollHeight")
