@@ -232,7 +232,7 @@ def _trigger_times(
     """Times of the pictures that a trigger log holds; the others are named in a warning."""
     columns, rows = read_csv(triggers, exact=True, known=TRIGGER_LOG, fault=ImageError)
     when = next((name for name in ("time_s", "time_utc") if name in columns), None)
-    which = next((name for name in ("image", "number") if name in columns), None)
+    which = next((name for name in ("image", "number", "station") if name in columns), None)
     if when is None or which is None:
         raise ImageError(
             f"{triggers}: has {as_line(', '.join(columns))}: a trigger log needs the columns image "

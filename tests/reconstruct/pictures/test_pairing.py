@@ -88,10 +88,11 @@ def test_a_trigger_log_pairs_and_times(tmp_path: Path) -> None:
     }
 
 
-def test_a_trigger_log_by_number_times_one_camera(tmp_path: Path) -> None:
+@pytest.mark.parametrize("which", ["number", "station"])  # the latter as `fly` writes it
+def test_a_trigger_log_by_number_times_one_camera(tmp_path: Path, which: str) -> None:
     sides = write(tmp_path, lambda k, own, time: f"DSC_{k:05d}")
     rows = [(k, 10 + 0.5 * k) for k in range(COUNT)]
-    log = table(tmp_path / "triggers.csv", "number,time_s", rows)
+    log = table(tmp_path / "triggers.csv", f"{which},time_s", rows)
     found, time_s = pair_by_time({"left": sides["left"]}, log, UTC)
     expected = [10 + 0.5 * k for k in range(COUNT) if k not in DROPPED["left"]]
     assert [time_s[one["left"]] for one in found] == expected
