@@ -163,6 +163,7 @@ def test_bend_of_a_track_is_the_sag_of_its_heights_and_not_their_tilt() -> None:
     assert bend_mm(true, tilted + lower[:, None] * [0, 0, 1]) == pytest.approx(5.0)
 
 
+@pytest.mark.slow
 def test_one_part_runs_and_one_is_left_out(tmp_path: Path) -> None:
     out = tmp_path / "out"
     command = [sys.executable, "-m", "benchmarks", "--work", str(out), "--quick", "--only",

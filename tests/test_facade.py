@@ -52,6 +52,7 @@ def test_a_camera_sees_its_target_in_the_middle_with_what_is_above_on_top() -> N
     np.testing.assert_allclose(edge, [scene.SIZE_PX[0], scene.SIZE_PX[1] / 2], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_texture_coordinates_of_the_wall_are_places_on_it() -> None:
     corners, triangles, places = scene.mesh()
     flat = triangles[np.ptp(corners[triangles][..., 1], axis=1) == 0].ravel()

@@ -38,6 +38,7 @@ def truth() -> Truth:
     return true_harbour(QUICK, 12, spacing_m=0.1)
 
 
+@pytest.mark.slow
 def test_meshes_lie_on_the_true_surface_and_face_the_water() -> None:
     for item in still_harbour().objects:
         vertices = item.vertices.astype(np.float64) + still_harbour().offset_ned
@@ -167,6 +168,7 @@ def test_an_overhang_needs_both_of_its_surfaces() -> None:
     assert halved["lower"] == 1.0
 
 
+@pytest.mark.slow
 def test_points_on_a_fish_are_found_and_kept_apart(truth: Truth) -> None:
     rng = np.random.default_rng(3)
     at = time_of(5)
@@ -259,6 +261,7 @@ def fishy_station() -> int:
     return int(np.argmax(seen))
 
 
+@pytest.mark.slow
 def test_fish_of_the_judge_are_those_of_the_renderer() -> None:
     station = fishy_station()
     camera = harbour_rig(12).cameras["left"]

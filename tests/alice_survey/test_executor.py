@@ -127,6 +127,7 @@ def test_an_engine_elsewhere_gives_the_same_results_and_reports(
         assert reported(threads.executor, capsys) == here
 
 
+@pytest.mark.slow
 def test_as_many_tasks_run_and_processes_start_as_there_is_memory_for(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -289,6 +289,7 @@ def test_a_stage_added_in_one_file_is_run_shown_reported_and_documented(
     assert (record.stage, record.version, record.settings) == ("toys", 1, {"seed": 3})
 
 
+@pytest.mark.slow
 def test_a_plan_made_for_a_vehicle_is_not_stale_when_that_flies(tmp_path: Path) -> None:
     (tmp_path / "survey.toml").write_text(
         "[area]\nlength_m = 1.0\nwidth_m = 1.2\nseafloor_depth_m = 5.0\n"

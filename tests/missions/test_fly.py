@@ -145,6 +145,7 @@ def test_a_stale_plan_is_flown_with_a_warning_and_options_are_said_to_be_for_onc
     assert "survey.toml" in warned
 
 
+@pytest.mark.slow
 def test_an_exported_mission_is_flown_next_to_its_certificate(
     workspace: Path, tmp_path: Path
 ) -> None:

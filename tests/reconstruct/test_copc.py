@@ -94,6 +94,7 @@ def test_every_point_is_there_once(name: str, tmp_path: Path):
             assert (minimum, maximum) == pytest.approx((at.min(), at.max()), abs=1e-9)
 
 
+@pytest.mark.slow
 def test_a_long_strip_is_found_by_bounds(strip: tuple[Path, np.ndarray]):
     path, written = strip
     rng = np.random.default_rng(3)
@@ -108,6 +109,7 @@ def test_a_long_strip_is_found_by_bounds(strip: tuple[Path, np.ndarray]):
             assert inside.sum() > 100
 
 
+@pytest.mark.slow
 def test_every_level_is_an_even_thinning_of_the_cloud(strip: tuple[Path, np.ndarray]):
     path, written = strip
     with laspy.CopcReader.open(path) as reader:
@@ -155,6 +157,7 @@ def test_workers_make_the_same_bytes(tmp_path: Path):
     assert files[0] == files[1]
 
 
+@pytest.mark.slow
 def test_memory_does_not_hold_the_cloud(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(copc, "_GRID_BITS", 5)
     monkeypatch.setattr(copc, "_LEAF_POINTS", 1500)

@@ -121,6 +121,7 @@ def test_constants_and_code_of_a_called_kernel_count(folder: Path) -> None:
     assert ask(folder) == (4.0, 0)
 
 
+@pytest.mark.slow
 def test_a_kernel_whose_argument_has_a_new_class_name_is_compiled_again(tmp_path: Path) -> None:
     """The kept index names the old class, which is not there any more."""
     text = """
@@ -146,6 +147,7 @@ run.stats = twice.stats
     assert ask(tmp_path, ask_run) == (8.0, 1)
 
 
+@pytest.mark.slow
 def test_kernels_of_the_package_are_loaded_from_a_folder_that_nobody_writes_to(folder):
     shipped = folder / "_kernels"
     shipped.mkdir()
@@ -181,8 +183,8 @@ HOST = llvm.get_host_cpu_name()
     ("before", "given", "name", "notes"),
     [
         ("import numba", "", "x86-64-v3", 0),
-        (USED, "", HOST, 1),
-        (OLD, "x86-64-v3", HOST, 1),  # of the machine that started this one
+        pytest.param(USED, "", HOST, 1, marks=pytest.mark.slow),
+        pytest.param(OLD, "x86-64-v3", HOST, 1, marks=pytest.mark.slow),  # by another machine
         ("", "nehalem", "nehalem", 0),
     ],
 )
@@ -231,6 +233,7 @@ def test_recursion_ends() -> None:
     assert closure_digest(down) == closure_digest(down)
 
 
+@pytest.mark.slow
 def test_processes_that_start_together_compile_a_kernel_once(tmp_path):
     write(tmp_path)
     (tmp_path / "outer.py").write_text(OUTER)

@@ -88,6 +88,7 @@ def corner_rows(folder: Path) -> list[dict[str, str]]:
     return list(csv.DictReader((folder / "corners.csv").read_text().splitlines()))
 
 
+@pytest.mark.slow
 def test_a_real_stereo_set(real: tuple[Path, str, Any]) -> None:
     """OpenCV's own calibration of the set has 0.215 px and 3.327 squares."""
     folder, _, found = real
@@ -109,6 +110,7 @@ def test_a_real_stereo_set(real: tuple[Path, str, Any]) -> None:
     assert json.loads((folder / "calibration.json").read_text()) == found
 
 
+@pytest.mark.slow
 def test_opencv_agrees_on_the_real_set(real: tuple[Path, str, Any]) -> None:
     """The same corners in cv2.stereoCalibrate give the same rig, within two sigmas."""
     folder, _, found = real
@@ -189,6 +191,7 @@ def test_one_camera(dry: Path, truth: Rig, tmp_path: Path) -> None:
     assert not any(name.endswith("_rad") for name in rig.sigmas)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick")
 def test_corrupt_pictures_and_pictures_without_the_board_are_left_out(
     dry: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]

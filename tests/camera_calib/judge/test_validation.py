@@ -134,6 +134,7 @@ def test_the_same_calibration_twice_does_not_differ_and_drawn_ones_do_by_chance(
     assert 0.4 < np.mean([one.p_value for one in agree]) < 0.6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("longer", [0.0, 0.02])
 def test_sigmas_are_wider_where_halves_disagree(longer: float, tmp_path: Path) -> None:
     """Every other view was taken with a focal length that is 2 % longer."""

@@ -42,7 +42,7 @@ def test_no_direction_is_narrower_than_the_least_width(
             for shape in (QUAD, ELL, box(0, 0, 15, 17))
         ),
         # The search leaves fill lines out until it compares the best headings.
-        (ELL_WITH_HOLES, CALM, 120),
+        pytest.param(ELL_WITH_HOLES, CALM, 120, marks=pytest.mark.slow),
     ],
 )
 def test_no_sampled_heading_is_much_better(shape: Polygon, costs: Costs, count: int) -> None:

@@ -149,7 +149,9 @@ _FAULTS: dict[str, tuple[float, Callable[[Odometry, Odometry], Odometry]]] = {
 """Odometry that is wrong from a moment on, and within how many seconds nothing is flown by it."""
 
 
-@pytest.mark.parametrize("fault", _FAULTS)
+@pytest.mark.parametrize(
+    "fault", [pytest.param(f, marks=() if " for " in f else pytest.mark.slow) for f in _FAULTS]
+)
 def test_odometry_that_is_fresh_but_wrong_ends_the_mission(
     following: LoopFlight, fault: str
 ) -> None:

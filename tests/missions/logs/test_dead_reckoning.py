@@ -71,7 +71,7 @@ def test_the_smoother_is_least_squares_over_all_places(at: list[int]) -> None:
     assert track.refused == 0
 
 
-@pytest.mark.parametrize("at", [[0], [0, 399]])
+@pytest.mark.parametrize("at", [[0], pytest.param([0, 399], marks=pytest.mark.slow)])
 def test_sigmas_are_those_of_the_errors(at: list[int]) -> None:
     ratios = []
     for seed in range(200):

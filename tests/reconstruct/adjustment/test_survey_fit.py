@@ -225,6 +225,7 @@ def test_a_calibration_with_sigmas_lets_the_survey_refine_the_rig(tmp_path: Path
         refined(wrong, few, refine_rig="on")
 
 
+@pytest.mark.slow
 def test_a_large_survey_is_adjusted_in_parts_as_a_whole(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

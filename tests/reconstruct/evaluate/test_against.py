@@ -49,6 +49,7 @@ def survey(seed: int, world_from_own: RigidTransform, mound_m: float) -> Elevati
     return Elevation(height=height, sigma=sigma, west=0.0, north=4.0, cell=CELL)
 
 
+@pytest.mark.slow
 def test_a_mound_is_measured_within_its_sigma_and_nothing_else_changes() -> None:
     ratios = []
     for seed in range(5):

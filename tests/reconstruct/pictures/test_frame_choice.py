@@ -91,6 +91,7 @@ def test_blurred_frames_are_not_taken_where_sharp_ones_are_near() -> None:
     assert not blurred & set(taken[:-1])  # every window holds a sharp one
 
 
+@pytest.mark.slow
 def test_a_cut_and_black_frames_are_reported() -> None:
     """The first scene, half a second of black in it, then another scene."""
     x = 6.0 * np.arange(80)

@@ -347,7 +347,8 @@ def placed_by(gauge: Gauge, ties: ControlFit, known_scale: float | None) -> Plac
     )
 
 
-@pytest.mark.parametrize("known_scale", [pytest.param(None, marks=pytest.mark.slow), 1.0])
+@pytest.mark.slow
+@pytest.mark.parametrize("known_scale", [None, 1.0])
 def test_a_wrong_point_is_left_out_and_the_rest_has_its_real_sigma(
     known_scale: float | None,
 ) -> None:

@@ -151,6 +151,7 @@ def exif(scene: Scene, seed: int) -> list[ImageRecord]:
     return stating(scene.records, places, sigma_horizontal_m=3.0, sigma_depth_m=6.0, **unknown)
 
 
+@pytest.mark.slow
 def test_positions_closer_than_their_sigma_give_a_rough_scale_with_an_honest_sigma(
     capsys: pytest.CaptureFixture[str],
 ) -> None:

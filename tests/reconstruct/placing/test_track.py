@@ -103,6 +103,7 @@ def test_errors_of_the_place_move_every_picture_as_the_covariance_says() -> None
     assert_close(found, scatter(poses, moved))
 
 
+@pytest.mark.slow
 def test_errors_of_a_station_move_its_other_camera_on_its_arm() -> None:
     """The rig's origin is off in the model; both its pictures follow, in the world."""
     rng = np.random.default_rng(3)

@@ -171,6 +171,7 @@ def test_tracks_are_as_the_model_states() -> None:
     assert np.all(np.bincount(pixels.station, minlength=stations) > 20)
 
 
+@pytest.mark.slow
 def test_four_times_the_views_halve_the_sigmas_of_a_calibration() -> None:
     few, many = (calibrated(views).sigmas for views in (25, 100))
     ratios = np.array([few[name] / many[name] for name in few])
@@ -185,6 +186,7 @@ def test_control_points_place_a_survey() -> None:
     assert 0.003 < np.sqrt((held**2).mean()) < 0.01
 
 
+@pytest.mark.slow
 def test_measures_are_ranked_by_what_a_minute_buys() -> None:
     base = Candidate(config=settings(), rig=rig())
     found = single_measures(base)

@@ -130,6 +130,7 @@ def test_a_survey_as_planned_has_no_weak_place() -> None:
     assert found.seen.share_at_overlap >= 0.999
 
 
+@pytest.mark.slow
 def test_a_hole_a_strip_of_blur_and_a_loose_corner_are_cured_by_the_dive() -> None:
     good = ~(HOLE | BLURRED | AROUND)
     found = surveyed(good, BLURRED)

@@ -41,7 +41,7 @@ def find(picture: np.ndarray, board: PoolBoard) -> tuple[np.ndarray, np.ndarray]
     ("name", "aim", "distance_m", "turn_deg"),
     [
         ("left", (0.5, 0.5), 0.8, (3.0, -4.0, 2.0)),
-        ("right", (0.42, 0.55), 0.9, (25.0, 5.0, -8.0)),
+        pytest.param("right", (0.42, 0.55), 0.9, (25.0, 5.0, -8.0), marks=pytest.mark.slow),
         pytest.param("left", (0.35, 0.4), 1.1, (-10.0, 28.0, 12.0), marks=pytest.mark.slow),
         pytest.param("right", (0.7, 0.65), 1.3, (12.0, -15.0, 30.0), marks=pytest.mark.slow),
     ],

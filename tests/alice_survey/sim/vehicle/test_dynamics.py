@@ -305,12 +305,11 @@ def test_water_inside_the_nose_is_carried_where_it_is() -> None:
     np.testing.assert_allclose(wrench, [0, 0, 0, low * 0.1, -low * 0.03, 0], atol=1e-14)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("vehicle", "seconds", "at_10_ms", "at_5_ms"),
-    [
-        pytest.param(m.alice(), 20, 5e-6, 1e-6, id="open-water", marks=pytest.mark.slow),
-        pytest.param(vehicle_from("alice"), 12, 2e-5, 5e-6, id="all-laws"),
-    ],
+    [(m.alice(), 20, 5e-6, 1e-6), (vehicle_from("alice"), 12, 2e-5, 5e-6)],
+    ids=["open-water", "all-laws"],
 )
 def test_runge_kutta_agrees_with_an_adaptive_method(
     vehicle: Vehicle, seconds: int, at_10_ms: float, at_5_ms: float

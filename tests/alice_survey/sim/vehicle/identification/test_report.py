@@ -99,6 +99,7 @@ def test_a_log_is_predicted_open_loop_by_what_was_identified(
     assert (tmp_path / "out" / "fit.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["joint", "two-step"])
 def test_the_command_takes_a_bollard_pull_and_held_values(
     logs: tuple[Path, Path], tmp_path: Path, method: str
