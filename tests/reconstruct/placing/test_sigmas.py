@@ -128,7 +128,7 @@ def place(
 def test_errors_over_their_sigmas_are_of_unit_size(tau_s: float) -> None:
     """From white errors to ones that outlast the survey; a wrong independence gives 3 to 7."""
     body, ratios = flight(), []
-    for seed in range(7):
+    for seed in range(5):
         _, error, sigma = place(body, flown(body, [int(tau_s), seed], tau_s), seed)
         ratios.append(error[:6] / sigma[:6])
     position, turns = np.array(ratios)[:, :3], np.array(ratios)[:, 3:]
@@ -149,7 +149,7 @@ def test_correlation_is_found() -> None:
 def test_a_heading_that_turns_the_reckoned_track_too_is_one_error_not_two() -> None:
     """Compass error turns both headings and the positions integrated along them."""
     body, ratios = flight(), []
-    for seed in range(7):
+    for seed in range(5):
         rng = np.random.default_rng([5, seed])
         errors = SIGMA * gauss_markov(rng, len(body), 4000.0)
         turn = errors[:, 5].mean()
@@ -222,7 +222,7 @@ def test_times_that_scatter_are_named_and_leave_the_heading_its_sigma(
     """Readings of other times than the pictures', with one constant error of the compass."""
     body, ratios = flight(6, 14), []
     time: Array = STEP_S * np.arange(len(body), dtype=np.float64)
-    for seed in range(5):
+    for seed in range(3):
         rng = np.random.default_rng([seed, 46])
         errors = SIGMA * gauss_markov(rng, len(body), 400.0)
         errors[:, 5] = SIGMA[5] * rng.normal()
@@ -286,8 +286,11 @@ def test_the_correlated_share_is_that_of_the_mean(tau: float) -> None:
 
 
 @pytest.mark.slow
-def test_twenty_flights_are_placed_within_their_sigmas() -> None:
-    """The built-in flight simulator, its sensors and its filter, 20 times over one small plan."""
+def test_ten_flights_are_placed_within_their_sigmas() -> None:
+    """The built-in flight simulator, its sensors and its filter, 10 times over one small plan.
+
+    A heading's ten values are within the bounds of chi squared at 99 %; all 60 notice 30 %.
+    """
     from alice_survey.core.config import AreaConfig, PlanConfig, SurveyConfig
     from camera_calib.rig import design_rig
     from missions.fly.simulation import flight_settings, floor_grid, simulate_plan
@@ -301,7 +304,7 @@ def test_twenty_flights_are_placed_within_their_sigmas() -> None:
     plan = plan_survey(config, design_rig(config.camera, config.water)).plan
     floor = floor_grid(terrain_of(config, plan))
     ratios = []
-    for seed in range(20):
+    for seed in range(10):
         flight_ = simulate_plan(
             plan, flight_settings(config), floor, np.random.default_rng([seed, 20]), label=""
         )
@@ -322,7 +325,8 @@ def test_twenty_flights_are_placed_within_their_sigmas() -> None:
         ratios.append(error[:6] / stated[:6])
     position, tilt, heading = np.split(np.array(ratios), [3, 5], axis=1)
     for part in (position, tilt, heading):
-        assert 0.7 < np.sqrt(np.mean(part**2)) < 1.4
+        assert 0.46 < np.sqrt(np.mean(part**2)) < 1.59
+    assert 0.77 < np.sqrt(np.mean(np.square(ratios))) < 1.25
 
 
 def test_sigmas_that_are_stated_too_small_are_enlarged() -> None:
@@ -392,7 +396,7 @@ def test_long_gaps_lie_between_dives() -> None:
 @pytest.mark.parametrize("restart", [True, False])
 def test_two_dives_are_as_sure_as_their_errors_are_independent(restart: bool) -> None:
     found, stated, restarts = [], [], []
-    for seed in range(8):
+    for seed in range(5):
         fit, errors, sigma = place(TWO_DIVES, two_dives(seed, 0.0, restart=restart), seed)
         found.append(errors[:3] / SIGMA[:3])
         stated.append(sigma[:3] / SIGMA[:3])
@@ -411,7 +415,7 @@ def test_two_dives_are_as_sure_as_their_errors_are_independent(restart: bool) ->
 @pytest.mark.parametrize("jump_m", [0.5, 5.0])
 def test_dives_that_contradict_each_other_leave_the_place_that_unsure(jump_m: float) -> None:
     ratios = []
-    for seed in range(8):
+    for seed in range(4):
         fit, errors, sigma = place(TWO_DIVES, two_dives(seed, jump_m), seed)
         assert not any(fit.record.left_out.values())
         assert fit.correlation["horizontal"].restart * SIGMA[0] > 0.1 * jump_m
@@ -459,9 +463,9 @@ def fitted(seed: int, factor: float) -> tuple[PlacementFit, Array]:
 
 
 def whitened(factor: float) -> tuple[Array, Array]:
-    """Factors found of 12 models, and errors of their modes over what is stated."""
+    """Factors found of 5 models, and errors of their 80 modes over what is stated."""
     found, off = [], []
-    for seed in range(12):
+    for seed in range(5):
         fit, error = fitted(seed, factor)
         found.append(fit.record.soft_modes_factor)
         off.append(error / np.sqrt(np.diag(fit.joint)[_PLACE:]))
@@ -479,7 +483,7 @@ def test_modes_of_the_stated_size_stay_as_they_are() -> None:
 @pytest.mark.parametrize("factor", [2.5, 6.0])
 def test_modes_larger_than_stated_are_found_and_their_sigmas_are_true(factor: float) -> None:
     found, off = whitened(factor)
-    assert 0.85 * factor < np.median(found) < 1.2 * factor
+    assert 0.8 * factor < np.sqrt(np.mean(found**2)) < 1.25 * factor  # of 80 modes, 8 % each way
     assert 0.75 < np.sqrt((off**2).mean()) < 1.3
 
 
@@ -505,7 +509,7 @@ def bends_of(
 @pytest.mark.parametrize("tau_s", [1.0, 4000.0])
 def test_a_bent_block_shows_its_curvature(tau_s: float) -> None:
     body = flight(8, 40)
-    for seed in range(3):
+    for seed in range(2):
         found = bends_of(body, flown(body, [3, seed], tau_s), 4e-3, -6e-3, seed)
         along, across = found
         assert along.curvature_per_m == pytest.approx(4e-3, abs=3.5 * along.sigma_per_m)
@@ -519,14 +523,14 @@ def test_a_bent_block_shows_its_curvature(tau_s: float) -> None:
 @pytest.mark.slow
 def test_straight_blocks_are_not_called_bent_and_sigmas_are_true() -> None:
     body, pulls, called = flight(6, 20), [], 0
-    for seed in range(30):
+    for seed in range(15):
         tau_s = [1.0, 60.0, 4000.0][seed % 3]
         for bend in bends_of(body, flown(body, [8, seed], tau_s), 0.0, 0.0, seed):
             pulls.append(bend.curvature_per_m / bend.sigma_per_m)
             called += bend.is_significant(1e-4)
-    assert len(pulls) == 60
+    assert len(pulls) == 30
     assert 0.6 < np.sqrt(np.mean(np.square(pulls))) < 1.4
-    assert called <= 2
+    assert called <= 1
 
 
 def test_sigmas_that_are_stated_too_small_do_not_make_a_bend() -> None:
@@ -586,7 +590,7 @@ def with_mount(words: str, seed: int) -> tuple[PlacementFit, RigidTransform, Arr
 @pytest.mark.parametrize("words", ["nadir-bow-left", "forward+45"])
 def test_the_mount_is_found_within_its_sigmas(words: str) -> None:
     turns, arms, places = [], [], []
-    for seed in range(6):
+    for seed in range(4):
         fit, true, error = with_mount(words, seed)
         off = (true.rotation * fit.mount.body_from_rig.rotation.inv()).as_rotvec(degrees=True)
         assert np.abs(off).max() < 2.0
