@@ -149,11 +149,11 @@ def _cells(points: np.ndarray, edge: float, info: object) -> tuple[np.ndarray, n
 
 @pytest.mark.slow
 def test_workers_make_the_same_bytes(tmp_path: Path):
-    parts = np.array_split(floor(45.0, 24.0), 7)  # six cubes
+    parts = np.array_split(floor(22.5, 12.0), 7)  # six cubes of half their usual edge
     files = []
     for name, executor in (("a", SERIAL), ("b", local_executor(2))):
         (tmp_path / name).mkdir()
-        files.append(write(tmp_path / name, parts, executor=executor)[0].read_bytes())
+        files.append(write(tmp_path / name, parts, SPACING_M / 2, executor)[0].read_bytes())
     assert files[0] == files[1]
 
 
