@@ -75,7 +75,8 @@ class Module(NamedTuple):
     """One source file of the four packages."""
 
     text: str
-    tree: ast.Module
+    nodes: tuple[ast.AST, ...]
+    """All parts of its code."""
 
 
 @cache
@@ -85,14 +86,14 @@ def modules() -> dict[str, Module]:
     for package in PACKAGES:
         for path, text in _texts(package).items():
             name = path.removesuffix(".py").replace("/", ".").removesuffix(".__init__")
-            found[name] = Module(text, ast.parse(text))
+            found[name] = Module(text, tuple(ast.walk(ast.parse(text))))
     return found
 
 
 def nodes(kind: type[T]) -> Iterator[tuple[str, T]]:
     """Parts of the code of a kind, with the module that each is in."""
     for name, module in modules().items():
-        for node in ast.walk(module.tree):
+        for node in module.nodes:
             if isinstance(node, kind):
                 yield name, node
 
@@ -128,7 +129,7 @@ def imports() -> dict[str, set[str]]:
     found: dict[str, set[str]] = {}
     for name, module in known.items():
         used = set()
-        for node in ast.walk(module.tree):
+        for node in module.nodes:
             if isinstance(node, ast.ImportFrom) and node.module:
                 for alias in node.names:
                     inner = f"{node.module}.{alias.name}"
@@ -164,7 +165,7 @@ def without_a_layer() -> list[str]:
         name
         for name, module in modules().items()
         if name not in PACKAGES
-        and len(module.tree.body) > 1
+        and sum(isinstance(node, ast.stmt) for node in module.nodes) > 1
         and not any(name == layer or name.startswith(f"{layer}.") for layer in named)
     ]
 
@@ -204,13 +205,13 @@ def avoided_identifiers() -> list[str]:
     return [
         f"{name}.{identifier}"
         for name, module in modules().items()
-        for identifier in sorted(set(_identifiers(module.tree)) - set(rule["allowed"]))
+        for identifier in sorted(set(_identifiers(module)) - set(rule["allowed"]))
         if avoided.search(identifier.strip("_"))
     ]
 
 
-def _identifiers(tree: ast.Module) -> Iterator[str]:
-    for node in ast.walk(tree):
+def _identifiers(module: Module) -> Iterator[str]:
+    for node in module.nodes:
         match node:
             case ast.Name(id=name) | ast.arg(arg=name) | ast.Attribute(attr=name):
                 yield name
