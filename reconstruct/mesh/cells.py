@@ -12,7 +12,7 @@ libraries lack: vertices can be locked, so that tiles still meet after each was 
 no collapse changes the topology (link condition, Dey et al. 1999) or turns a face over; and the
 result does not depend on threads.
 
-Edges collapse in rounds: the cheapest first, none in the neighbourhood of another of its round.
+Edges collapse in rounds: the cheapest first, none at an end of another of its round.
 """
 
 import math
@@ -27,13 +27,13 @@ from numpy.typing import NDArray
 from alice_survey.core.compiled import compiled
 from alice_survey.core.executor import Executor
 from alice_survey.core.frames import Array
-from reconstruct.mesh.topology import Triangles, component_areas, edges_of, split_fans
+from reconstruct.mesh.topology import Triangles, component_areas, count_edges, edges_of, split_fans
 from reconstruct.mesh.visibility import distances_from
 
 _MAX_ROUNDS = 60
 _ENOUGH = 0.004
 """A round that removes less than this share of the vertices is the last."""
-_SHARE = 0.5
+_SHARE = 0.3
 """Only this share of the edges, the cheapest, may collapse in one round."""
 _RIM_WEIGHT = 3.0
 """Weight of the planes that hold the outline of a mesh, over that of its faces."""
@@ -76,18 +76,19 @@ def decimate(
     for _ in range(_MAX_ROUNDS):
         if not len(faces):
             break
-        edges, edge = edges_of(faces)
-        count = np.bincount(edge, minlength=len(edges))
+        edges, count = count_edges(faces)
         rim_edge = count == 1
         rim = np.zeros(len(place), np.bool_)
         rim[edges[rim_edge]] = True
         cost, target_place = _costs(place, quadrics, edges, rim_edge, rim, fixed)
-        able = np.flatnonzero(cost <= error * error)
+        cheapest = int(_SHARE * len(edges))
+        largest = min(np.partition(cost, cheapest)[cheapest], error * error)
+        able = np.flatnonzero(cost <= largest)
         if not len(able):
             break
-        order = able[np.argsort(cost[able], kind="stable")][: max(1, int(_SHARE * len(edges)))]
+        order = able[np.argsort(cost[able], kind="stable")]
         corners = np.argsort(faces.reshape(-1), kind="stable")
-        starts = np.searchsorted(faces.reshape(-1)[corners], np.arange(len(place) + 1))
+        starts = np.cumsum(np.bincount(faces.reshape(-1) + 1, minlength=len(place) + 1))
         gone = _collapse(
             place,
             faces,
@@ -219,7 +220,7 @@ def _turns_or_thins(
     old, new, corner = np.empty(3), np.empty(3), np.empty((3, 3))
     for i in range(ring.size):
         face = faces[ring[i]]
-        if face[0] == other or face[1] == other or face[2] == other:
+        if face[0] < 0 or face[0] == other or face[1] == other or face[2] == other:
             continue
         before = _normal(place[face[0]], place[face[1]], place[face[2]], old)
         for k in range(3):
@@ -249,7 +250,11 @@ def _collapse(
     starts: NDArray[np.int64],
     around: NDArray[np.int64],
 ) -> int:
-    """Collapse edges in order, in place, none next to another; returns how many."""
+    """Collapse edges in order, in place, no two of one vertex; returns how many.
+
+    What is known of an edge stays true while its own ends do not change. Faces that are gone have
+    -1 for their first corner.
+    """
     touched = np.zeros(place.shape[0], np.bool_)
     mark = np.full(place.shape[0], -1, np.int64)
     gone = 0
@@ -259,10 +264,14 @@ def _collapse(
             continue
         ring_a, ring_b = around[starts[a] : starts[a + 1]], around[starts[b] : starts[b + 1]]
         for i in range(ring_a.size):
+            if faces[ring_a[i], 0] < 0:
+                continue
             for k in range(3):
                 mark[faces[ring_a[i], k]] = n
         common = 0
         for i in range(ring_b.size):
+            if faces[ring_b[i], 0] < 0:
+                continue
             for k in range(3):
                 vertex = faces[ring_b[i], k]
                 if mark[vertex] == n and vertex != a and vertex != b:
@@ -274,12 +283,7 @@ def _collapse(
             continue
         if _turns_or_thins(place, faces, ring_b, b, a, target_place[n]):
             continue
-        for i in range(ring_a.size):
-            for k in range(3):
-                touched[faces[ring_a[i], k]] = True
-        for i in range(ring_b.size):
-            for k in range(3):
-                touched[faces[ring_b[i], k]] = True
+        touched[a] = touched[b] = True
         for i in range(ring_b.size):
             face = ring_b[i]
             if faces[face, 0] == a or faces[face, 1] == a or faces[face, 2] == a:

@@ -17,11 +17,30 @@ def edges_of(triangles: Triangles) -> tuple[NDArray[np.int64], NDArray[np.int64]
         (E, 2) vertex numbers, the smaller first, in ascending order; and for each of the 3 T sides
         (side s of triangle t, from corner s to the next, is 3 t + s) the number of its edge.
     """
-    sides = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=-1).reshape(-1, 2)
-    sides = np.sort(sides.astype(np.int64), axis=1)
-    base = int(sides.max(initial=0)) + 1
-    key, edge = np.unique(sides[:, 0] * base + sides[:, 1], return_inverse=True)
-    return np.stack([key // base, key % base], axis=1), edge.reshape(-1)
+    key = _side_keys(triangles)
+    order = np.argsort(key, kind="stable")
+    starts = np.diff(key[order], prepend=-1) > 0
+    edge = np.empty(len(key), np.int64)
+    edge[order] = np.cumsum(starts) - 1
+    return _ends(key[order][starts]), edge
+
+
+def count_edges(triangles: Triangles) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Edges of a mesh as `edges_of` has them, and how many triangles are at each."""
+    key = np.sort(_side_keys(triangles), kind="stable")
+    first = np.flatnonzero(np.diff(key, prepend=-1))
+    return _ends(key[first]), np.diff(first, append=len(key))
+
+
+def _side_keys(triangles: Triangles) -> NDArray[np.int64]:
+    """(3 T,) both ends of every side in one number; in nearly the order of the triangles'."""
+    start = triangles.astype(np.int64)
+    end = np.roll(start, -1, axis=1)
+    return np.asarray(np.minimum(start, end) << 32 | np.maximum(start, end)).reshape(-1)
+
+
+def _ends(key: NDArray[np.int64]) -> NDArray[np.int64]:
+    return np.stack([key >> 32, key & 0xFFFFFFFF], axis=1)
 
 
 def twin_sides(edge: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
