@@ -42,8 +42,7 @@ from alice_survey.sim.seafloor.texture import SAND_ALBEDO, Texture, survey_textu
 from camera_calib.approximation.pinhole_warp import best_warp
 from camera_calib.rig import Rig
 from camera_calib.water import water_optics
-from reconstruct.dense.cloud import write_cloud, write_cloud_json
-from reconstruct.ply import VERTEX
+from reconstruct.dense.cloud import VERTEX, write_cloud, write_cloud_json
 from reconstruct.raster import DemGrid, tiled_raster
 from reconstruct.views.model import WorldFrame, write_frame
 from reconstruct.views.model_files import colmap_pinhole, rigid3d

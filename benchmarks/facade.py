@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import laspy
 import numpy as np
 import rasterio
 from numpy.typing import NDArray
@@ -37,7 +38,6 @@ from benchmarks.measured import measured
 from reconstruct.evaluate.scores import read_mesh
 from reconstruct.placing.alignment import Similarity, align_similarity
 from reconstruct.placing.track import read_track_poses
-from reconstruct.ply import read_header, read_ply_points
 
 _LENGTH_BETWEEN = ((-1.95, 0.0, 2.45), (1.95, 0.0, 2.45))
 _LENGTH_IN = 4
@@ -45,7 +45,6 @@ _LENGTH_IN = 4
 _NEAR_PX = 3.0
 _SAMPLES = 10_000
 _MIN_PICTURES = 3
-_ALL_POINTS = 2**40
 
 
 def main() -> None:
@@ -186,8 +185,8 @@ def judge(workspace: Path, cameras: list[dict[str, Any]], names: list[str]) -> d
     ]
     pixel_m = 2.0 * 5.0 * np.tan(np.deg2rad(0.5 * scene.FOV_DEG)) / scene.SIZE_PX[0]
     dense = workspace / "dense"
-    cloud = _scene(read_ply_points(dense / "cloud.ply", _ALL_POINTS), moved)
-    sigma = read_header(dense / "cloud.ply").rows()["sigma"].astype(np.float64) * moved.scale
+    points = laspy.read(dense / "cloud.copc.laz")
+    cloud, sigma = _scene(points.xyz, moved), np.asarray(points["sigma"]) * moved.scale
     samples, away = surface_samples()
     seen = pictures_that_see(samples, away, cameras) >= _MIN_PICTURES
     gap = cKDTree(cloud).query(samples[seen], distance_upper_bound=_NEAR_PX * pixel_m)[0]

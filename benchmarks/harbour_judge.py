@@ -10,6 +10,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import laspy
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -29,7 +30,6 @@ from reconstruct.elevation import elevation_in
 from reconstruct.evaluate.scores import read_mesh
 from reconstruct.pictures.undistorted import MOVING
 from reconstruct.placing.track import read_track_poses
-from reconstruct.ply import read_header, read_ply_points
 
 SLOPES_DEG = (0.0, 27.0, 60.0, 100.0, 180.0)
 """Bounds of classes of slope: gentle, steep, walls, overhangs."""
@@ -304,16 +304,16 @@ def judge(workspace: Path, truth: Truth) -> dict[str, Any]:
     }
     moved = aligned.truth_from_world
     dense = workspace / "dense"
-    if (dense / "cloud.ply").exists():
-        cloud = _ned(read_ply_points(dense / "cloud.ply", 2**40), moved)
-        sigma = read_header(dense / "cloud.ply").rows()["sigma"].astype(np.float64)
+    if (dense / "cloud.copc.laz").exists():
+        points = laspy.read(dense / "cloud.copc.laz")
+        cloud, sigma = _ned(points.xyz, moved), np.asarray(points["sigma"], np.float64)
         near = points_near(cloud, truth)
         found["cloud"] = score_points(cloud, sigma, truth)
         found["cloud"]["complete"] = completeness(near, truth)
         found["cloud"]["overhangs"] = overhangs(near, truth)
     if (dense / "dem.tif").exists():
         found["dem"] = _score_dem(dense, moved, truth)
-    if (workspace / "mesh" / "mesh.ply").exists():
+    if (workspace / "mesh" / "mesh.glb").exists():
         found["mesh"] = _score_mesh(workspace / "mesh", moved, truth)
     for name, below in (("mosaic", Path()), ("mosaic of the wall", Path("planes/wall"))):
         if (workspace / "mosaic" / below / "mosaic.tif").exists():

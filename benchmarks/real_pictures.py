@@ -60,11 +60,7 @@ def reconstruct(name: str, arguments: list[str], workspaces: Path) -> Findings:
 
 def cloud_utm(workspace: Path, epsg: int) -> Array:
     """Our cloud's points, (N, 3) easting, northing, height."""
-    import open3d as o3d
-
-    offset = json.loads((workspace / "dense" / "cloud.json").read_text())["offset_east_north_up"]
-    cloud = o3d.io.read_point_cloud(str(workspace / "dense" / "cloud.ply"))
-    local = np.asarray(cloud.points) + np.asarray(offset)
+    local = laspy.read(workspace / "dense" / "cloud.copc.laz").xyz
     datum = read_frame(workspace / "sparse" / "frame.json").datum
     if datum is None:
         raise SystemExit(f"{workspace} is not georeferenced")

@@ -12,7 +12,6 @@ ray meets of the surface, so that every picture is that of a pinhole, of this su
 import shutil
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from itertools import groupby, islice
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +33,9 @@ from alice_survey.core.frames import Array
 from alice_survey.core.records import MeshRecord, SurfaceRecord
 from alice_survey.core.run import progress
 from reconstruct.copc import PointSpool, write_copc
+from reconstruct.dense.cloud import cloud_in_parts, frame_comments
 from reconstruct.evaluate.scores import read_mesh
+from reconstruct.mesh.formats import write_obj
 from reconstruct.mesh.visibility import ray_scene
 from reconstruct.pictures.undistorted import Pictures
 from reconstruct.raster import BLOCK, local_crs, opened_raster, small_cache, tiles_of_shape
@@ -226,29 +227,50 @@ def _mesh(source: Path, folder: Path, target: Destination) -> list[float]:
     """Write the textured mesh; return the easting, northing and height of its coordinates' zero."""
     old = np.array(MeshRecord.read(source / "mesh.json").offset_east_north_up)
     offset = np.round([*target.places(old[None, :2])[0], old[2]])
-    for path in (source / "mesh.mtl", *sorted(source.glob("texture_*"))):
-        shutil.copy2(path, folder / path.name)
 
-    heading = (
-        f"# offset_east_north_up {' '.join(repr(float(v)) for v in offset)}\n"
-        f"# {target.name}, unit m, x east, y north, z up\n"
-        f"# vertical datum: {target.frame.vertical_datum}\n"
-    )
-    with (
-        (source / "mesh.obj").open() as lines,
-        atomic_path(folder / "mesh.obj") as temporary,
-        temporary.open("w") as file,
-    ):
-        file.write(heading)
-        for is_vertex, group in groupby(lines, lambda line: line.startswith("v ")):
-            if not is_vertex:
-                file.writelines(line for line in group if not line.startswith("#"))
-                continue
-            while part := list(islice(group, _CHUNK)):
-                local = np.array([line.split()[1:4] for line in part], dtype=np.float64) + old
-                at = np.column_stack([target.places(local[:, :2]), local[:, 2]]) - offset
-                np.savetxt(file, at, fmt="v %.6f %.6f %.6f")
+    def places(enu: Array) -> Array:
+        local = enu + old
+        return np.column_stack([target.places(local[:, :2]), local[:, 2]]) - offset
+
+    heading = [
+        f"offset_east_north_up {' '.join(repr(float(v)) for v in offset)}",
+        f"{target.name}, unit m, x east, y north, z up",
+        f"vertical datum: {target.frame.vertical_datum}",
+    ]
+    write_obj(folder / "mesh.obj", source / "mesh.glb", places, heading)
     return [float(v) for v in offset]
+
+
+COPIES = "ply-obj"
+
+
+def export_copies(workspace: Path) -> tuple[str, dict[str, Any]]:
+    """Write the cloud of a workspace as PLY and its mesh as OBJ, into `ply-obj/`.
+
+    Returns:
+        What was written, as text and as JSON values.
+
+    Raises:
+        WorkspaceError: a stage is missing.
+    """
+    for needed in (DENSE, MESH):
+        needed.need(workspace)
+    inputs = [workspace / "dense", workspace / "mesh"]
+    stage = Stage(name=COPIES, version=1, command="reconstruct", settings={}, inputs=inputs)
+    run_stage(workspace, stage, partial(_write_copies, workspace))
+    folder = workspace / COPIES
+    return f"{COPIES}: cloud.ply, mesh.obj in {folder}", {"folder": str(folder)}
+
+
+@progress.step("write copies")
+def _write_copies(workspace: Path, folder: Path) -> None:
+    frame, mesh = read_frame(workspace / "sparse" / "frame.json"), workspace / "mesh"
+    cloud = cloud_in_parts(workspace / "dense", folder, frame)
+    if cloud.parent != folder:
+        shutil.copy2(cloud, folder / cloud.name)
+    offset = MeshRecord.read(mesh / "mesh.json").offset_east_north_up
+    comments = frame_comments(frame, offset)
+    write_obj(folder / "mesh.obj", mesh / "mesh.glb", np.asarray, comments)
 
 
 FOLDER = "undistorted"
@@ -278,7 +300,7 @@ def export_undistorted(workspace: Path, executor: Executor) -> tuple[str, dict[s
         command="reconstruct",
         settings={},
         inputs=[sparse / "model", sparse / "cameras.json", sparse / "frame.json",
-                workspace / "mesh" / "mesh.ply", workspace / "images"],
+                workspace / "mesh" / "mesh.glb", workspace / "images"],
         resumes=True,
     )  # fmt: skip
     run_stage(workspace, stage, partial(_write_undistorted, workspace, executor))
@@ -433,7 +455,7 @@ def bilinear(values: NDArray[Any], x: Array, y: Array) -> Array:
 
 def scene_of(mesh: Path) -> tuple[Any, Array]:
     """The mesh of a folder to cast rays at, and the origin (3,) of its coordinates in the world."""
-    return _scene(mesh, (mesh / "mesh.ply").stat().st_mtime_ns)
+    return _scene(mesh, (mesh / "mesh.glb").stat().st_mtime_ns)
 
 
 @lru_cache(maxsize=1)

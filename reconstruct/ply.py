@@ -1,4 +1,4 @@
-"""PLY files: clouds and meshes written part by part, points of our own and of others read.
+"""PLY files: clouds written part by part, points of our own and of others read.
 
 Reading and writing hold a part of the points in memory at a time, and a file that is cut short is
 refused: Open3D makes points at the origin of it. Format: http://paulbourke.net/dataformats/ply/.
@@ -27,33 +27,18 @@ _TYPES = {
 _NAMES = {"<f4": "float", "|u1": "uchar"}
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _MAX_HEADER = 1 << 16
-VERTEX = np.dtype(
-    [
-        ("x", "<f4"), ("y", "<f4"), ("z", "<f4"),
-        ("nx", "<f4"), ("ny", "<f4"), ("nz", "<f4"),
-        ("red", "u1"), ("green", "u1"), ("blue", "u1"),
-    ]
-)  # fmt: skip
-"""One point of a mesh: place, normal and colour."""
-_FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
 _COLOURED = {"nx", "ny", "nz", "red", "green", "blue", "sigma"}
 _CHUNK = 65_536
 """Points of which the bounds are kept, so that a tile reads only what may fall into it."""
 
 
-def write_ply(
-    path: Path,
-    parts: Iterable[NDArray[Any]],
-    comments: Sequence[str],
-    triangles: NDArray[np.int32] | None = None,
-) -> int:
-    """Write a binary PLY of points, or of a mesh.
+def write_ply(path: Path, parts: Iterable[NDArray[Any]], comments: Sequence[str]) -> int:
+    """Write a binary PLY of points.
 
     Args:
         path: of the file.
         parts: records of one type, of float32 and bytes, each dropped once it is written.
         comments: lines for the header.
-        triangles: (T, 3) numbers of points; None for a cloud.
 
     Returns:
         How many points were written.
@@ -65,10 +50,6 @@ def write_ply(
             names = [f"property {_NAMES[part.dtype[n].str]} {n}" for n in part.dtype.names or ()]
             file.write(part.tobytes())
             count += len(part)
-        if triangles is not None:
-            faces = np.empty(len(triangles), _FACE)
-            faces["count"], faces["corners"] = 3, triangles
-            file.write(faces.tobytes())
     header = [
         "ply",
         "format binary_little_endian 1.0",
@@ -76,8 +57,6 @@ def write_ply(
         f"element vertex {count}",
         *names,
     ]
-    if triangles is not None:
-        header += [f"element face {len(triangles)}", "property list uchar int vertex_indices"]
     with atomic_path(path) as temporary, temporary.open("wb") as file, body.open("rb") as source:
         file.write("\n".join([*header, "end_header", ""]).encode("ascii", "replace"))
         shutil.copyfileobj(source, file)

@@ -120,15 +120,20 @@ def _dense_summary(folder: Path) -> Summary:
     return text, found.to_json()
 
 
+def _cloud(dense: Path) -> list[Path]:
+    """The cloud that mosaics and meshes are made of: an overview where the whole is too large."""
+    points = _existing(dense / "cloud.ply") or [dense / "cloud.copc.laz"]
+    return [*points, dense / "cloud.json"]
+
+
 def _mosaic_inputs(workspace: Path) -> list[Path]:
     dense = workspace / "dense"
     planes = sorted((dense / "planes").glob("*/dem.tif"))
     about = _existing(*(path.with_name("plane.json") for path in (dense / "dem.tif", *planes)))
     about += _existing(dense / "moving.csv", workspace / COLOUR_FILE)
-    cloud = [dense / name for name in ("cloud.ply", "cloud.json")]
     bands = ("dem.tif", "sigma.tif", "count.tif")
     surfaces = [one.with_name(name) for one in (dense / "dem.tif", *planes) for name in bands]
-    return [*surfaces, *cloud, *about, *_model_inputs(workspace)]
+    return [*surfaces, *_cloud(dense), *about, *_model_inputs(workspace)]
 
 
 def _mosaic_summary(folder: Path) -> Summary:
@@ -141,8 +146,9 @@ def _mosaic_summary(folder: Path) -> Summary:
 
 
 def _mesh_inputs(workspace: Path) -> list[Path]:
-    dense = [workspace / "dense" / name for name in ("cloud.ply", "cloud.json", "light.json")]
-    return [*dense, *_existing(workspace / "dense" / "moving.csv"), *_model_inputs(workspace)]
+    dense = workspace / "dense"
+    about = [dense / "light.json", *_existing(dense / "moving.csv")]
+    return [*_cloud(dense), *about, *_model_inputs(workspace)]
 
 
 def _mesh_summary(folder: Path) -> Summary:
@@ -167,7 +173,7 @@ def _evaluate_inputs(workspace: Path) -> list[Path]:
         "sparse/registration.json", "plan/plan.json", "images/manifest.csv", "flight/triggers.csv",
     ]  # fmt: skip
     if read_stage(mesh) is not None:
-        read += ["mesh/mesh.ply", "mesh/mesh.json"]
+        read += ["mesh/mesh.glb", "mesh/mesh.json"]
     return [workspace / path for path in read]
 
 
@@ -237,7 +243,7 @@ DENSE = StageSpec(
     folder="dense",
     command="reconstruct",
     about="the surface: depth of every view, fused",
-    version=18,
+    version=19,
     work="reconstruct.dense.run:run_dense",
     takes=("reconstruct",),
     needs=("image", "placing"),
@@ -262,7 +268,7 @@ MOSAIC = StageSpec(
     folder="mosaic",
     command="reconstruct",
     about="the orthomosaic, painted on the surface",
-    version=14,
+    version=15,
     work="reconstruct.mosaic.run:run_mosaic",
     takes=("reconstruct", "water", "area.seafloor_depth_m"),
     needs=("image", "placing", "dense"),
@@ -308,7 +314,7 @@ EVALUATE = StageSpec(
     folder="evaluation",
     command="evaluate",
     about="errors against the truth of the simulation",
-    version=5,
+    version=6,
     work="reconstruct.evaluate.run:run_evaluate",
     takes=("seed",),
     needs=("image", "placing", "dense", "mosaic", "plan"),

@@ -1,4 +1,4 @@
-"""The coloured point cloud: the points of the surface, thinned for PLY, all of them for LAS."""
+"""The coloured point cloud: all points of the surface as LAS, and an even thinning of very many."""
 
 import math
 import shutil
@@ -14,9 +14,6 @@ from numpy.typing import NDArray
 from alice_survey.core.executor import Executor
 from alice_survey.core.records import CloudRecord
 from reconstruct.copc import PointSpool, SpooledPart, write_copc
-from reconstruct.dense.surface_tiles import SurfaceTile
-from reconstruct.dense.view_store import ViewStore
-from reconstruct.ply import VERTEX as MESH_VERTEX
 from reconstruct.ply import write_ply
 from reconstruct.raster import crs_of
 from reconstruct.views.model import WorldFrame
@@ -24,12 +21,22 @@ from reconstruct.views.model import WorldFrame
 if TYPE_CHECKING:
     import laspy
 
-VERTEX = np.dtype([*MESH_VERTEX.descr, ("sigma", "<f4")])
+    from reconstruct.dense.surface_tiles import SurfaceTile
+    from reconstruct.dense.view_store import ViewStore
+
+VERTEX = np.dtype(
+    [
+        ("x", "<f4"), ("y", "<f4"), ("z", "<f4"),
+        ("nx", "<f4"), ("ny", "<f4"), ("nz", "<f4"),
+        ("red", "u1"), ("green", "u1"), ("blue", "u1"), ("sigma", "<f4"),
+    ]
+)  # fmt: skip
 """One point: x east, y north, z up from the cloud's offset, normal, colour, standard deviation."""
 _MAX_OVERVIEW_POINTS = 40_000_000
-"""That programs without levels of detail hold at once."""
+"""That programs without levels of detail hold at once, and meshes are made of."""
 _OVERVIEW = "overview"
-_LAS_STEP = 1e-4
+_LAS_STEP, _STEPS_OF_A_CELL = 1e-4, 10.0
+_CHUNK = 1_000_000
 _LAS_EXTRA = {
     "nx": "normal, east",
     "ny": "normal, north",
@@ -89,17 +96,17 @@ def write_cloud(
 
 def write_clouds(
     folder: Path,
-    store: ViewStore,
-    tiles: Sequence[SurfaceTile],
+    store: "ViewStore",
+    tiles: Sequence["SurfaceTile"],
     offset_enu: Sequence[float],
     frame: WorldFrame,
     cell: float,
     executor: Executor,
 ) -> None:
-    """Write all points of a surface as COPC, and an overview that fits in memory as PLY.
+    """Write all points of a surface as COPC; and of too many for memory an overview as PLY.
 
     Args:
-        folder: for `cloud.copc.laz`, `cloud.ply` and `cloud.json`.
+        folder: for `cloud.copc.laz`, `cloud.json` and, if need be, `cloud.ply`.
         store: with the surface.
         tiles: of it, with one point or more in all.
         offset_enu: of the points of tiles.
@@ -109,45 +116,79 @@ def write_clouds(
     """
     count = sum(tile.count for tile in tiles)
     edge = cell * max(1.0, math.sqrt(count / _MAX_OVERVIEW_POINTS))  # of the overview's cubes
-    header = las_header(offset_enu, frame)
+    header = las_header(offset_enu, frame, cell)
     scratch = store.folder / "copc"
     shutil.rmtree(scratch, ignore_errors=True)  # of a run that was interrupted
     spool = PointSpool.of(scratch, header, cell)
     spool_tile = partial(_spool_tile, store, header, spool, (cell, edge))
     parts = list(executor.map(spool_tile, tiles, label="lay out the point cloud"))
-    overview = (np.asarray(store.load(tile.number, _OVERVIEW)) for tile in tiles)
-    points = write_cloud(folder / "cloud.ply", overview, offset_enu, frame)
-    write_cloud_json(folder / "cloud.json", points, offset_enu, edge, frame)
+    if edge > cell:
+        overview = (np.asarray(store.load(tile.number, _OVERVIEW)) for tile in tiles)
+        count = write_cloud(folder / "cloud.ply", overview, offset_enu, frame)
+    write_cloud_json(folder / "cloud.json", count, offset_enu, edge, frame)
     write_copc(folder / "cloud.copc.laz", header, spool, parts, executor)
 
 
 def _spool_tile(
-    store: ViewStore,
+    store: "ViewStore",
     header: "laspy.LasHeader",
     spool: PointSpool,
     sides: tuple[float, float],
-    tile: SurfaceTile,
+    tile: "SurfaceTile",
 ) -> SpooledPart:
-    """Put the points of a tile in the spool, and those of the overview in the store."""
+    """Put the points of a tile in the spool, and those of an overview in the store."""
     surface, (cell, edge) = tile.points(store), sides
+    if edge > cell:
+        store.save(tile.number, _OVERVIEW, vertices_of(surface, cell, edge))
     every = vertices_of(surface, cell, cell)
-    store.save(tile.number, _OVERVIEW, vertices_of(surface, cell, edge) if edge > cell else every)
     return spool.add(f"{tile.number}", las_points(every, header).array)
 
 
-def las_header(offset_enu: Sequence[float], frame: WorldFrame) -> "laspy.LasHeader":
+def cloud_in_parts(dense: Path, folder: Path, frame: WorldFrame) -> Path:
+    """A PLY of a cloud, of which any part can be read: the overview, or a copy of the COPC.
+
+    Args:
+        dense: folder of the cloud.
+        folder: where a copy, `cloud.ply`, may be made.
+        frame: of the cloud.
+    """
+    import laspy
+
+    if (overview := dense / "cloud.ply").exists():
+        return overview
+    with laspy.open(dense / "cloud.copc.laz") as file:
+        parts = (_vertices(part) for part in file.chunk_iterator(_CHUNK))
+        write_cloud(folder / "cloud.ply", parts, file.header.offsets.tolist(), frame)
+    return folder / "cloud.ply"
+
+
+def _vertices(points: "laspy.ScaleAwarePointRecord") -> NDArray[Any]:
+    """`VERTEX` records (N,) of points with a header of `las_header`."""
+    vertices = np.empty(len(points), VERTEX)
+    for axis, name in enumerate("xyz"):
+        vertices[name] = points[name.upper()] * points.scales[axis]
+    for name in ("red", "green", "blue"):
+        vertices[name] = points[name] // 257
+    for name in _LAS_EXTRA:
+        vertices[name] = points[name]
+    return vertices
+
+
+def las_header(offset_enu: Sequence[float], frame: WorldFrame, cell: float) -> "laspy.LasHeader":
     """The header of a LAS 1.4 file of `VERTEX` records (point format 7).
 
-    Coordinates are east, north and up in steps of 1/10000 of the unit, from the offset; colours are
-    16-bit; normals and sigma are extra dimensions. The projection is that of the rasters where
-    there is one.
+    Coordinates are east, north and up from the offset, in steps of 1/10000 of the unit or, where
+    points are closer than ten of these, of the next smaller power of ten; colours are 16-bit;
+    normals and sigma are extra dimensions. The projection is that of the rasters where there is
+    one.
     """
     import laspy
     import pyproj
 
     header = laspy.LasHeader(version="1.4", point_format=7)
     header.offsets = np.asarray(offset_enu, dtype=np.float64)
-    header.scales = np.full(3, _LAS_STEP)
+    finest = 10.0 ** math.floor(math.log10(cell / _STEPS_OF_A_CELL))
+    header.scales = np.full(3, min(_LAS_STEP, finest))
     header.creation_date = _NO_DATE
     header.add_extra_dims(
         [
@@ -179,7 +220,7 @@ def las_points(vertices: NDArray[Any], header: "laspy.LasHeader") -> "laspy.Scal
 def write_cloud_json(
     path: Path, count: int, offset_enu: Sequence[float], edge: float, frame: WorldFrame
 ) -> None:
-    """Write what the PLY cannot say."""
+    """Write what the cloud itself cannot say."""
     crs = crs_of(frame)
     CloudRecord.save(
         path,

@@ -226,8 +226,10 @@ def read_own_cloud(workspace: Path) -> Array:
         ReconstructionError: it is empty.
     """
     cloud = need_stage(workspace, "dense", "reconstruct") / "cloud.ply"
+    ready = cloud.exists()  # of a cloud that is too large to be read whole
+    cloud = cloud if ready else cloud.with_name("cloud.copc.laz")
     with file_faults(cloud, WorkspaceError):
-        points = read_ply_points(cloud, _MAX_POINTS)
+        points = read_ply_points(cloud, _MAX_POINTS) if ready else _apart(cloud)[0]
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) < 100:
         raise ReconstructionError(f"{cloud}: holds {len(points)} points")

@@ -158,19 +158,20 @@ _SAMPLES = 200_000
 
 
 def read_mesh(folder: Path) -> tuple[Array, Array]:
-    """Vertices of `mesh.ply`, (V, 3) NED metres in float64, and triangles, (T, 3).
+    """Vertices of `mesh.glb`, (V, 3) NED metres in float64, and triangles, (T, 3).
 
     Raises:
         WorkspaceError: the file holds no triangles.
     """
-    import open3d as o3d
+    import trimesh
 
     offset = np.array(MeshRecord.read(folder / "mesh.json").offset_east_north_up)
-    mesh = o3d.io.read_triangle_mesh(str(folder / "mesh.ply"))
-    if not len(mesh.triangles):
-        raise WorkspaceError(f"{folder / 'mesh.ply'}: holds no triangles")
-    enu = np.asarray(mesh.vertices, dtype=np.float64) + offset
-    return enu[:, [1, 0, 2]] * [1.0, 1.0, -1.0], np.asarray(mesh.triangles)
+    scene = trimesh.load_scene(folder / "mesh.glb", process=False, skip_materials=True)
+    if not scene.geometry:
+        raise WorkspaceError(f"{folder / 'mesh.glb'}: holds no triangles")
+    mesh = scene.to_mesh()
+    east_up_south = mesh.vertices + offset[[0, 2, 1]] * [1.0, 1.0, -1.0]
+    return east_up_south[:, [2, 0, 1]] * [-1.0, 1.0, -1.0], mesh.faces
 
 
 @progress.step("score the mesh")

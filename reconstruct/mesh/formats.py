@@ -1,10 +1,10 @@
-"""Textured meshes as GLB, OBJ with MTL, PLY, and a picture of one seen at a slant.
+"""Textured meshes as GLB, from it as OBJ with MTL, and a picture of one seen at a slant.
 
 trimesh writes the GLB; pages of texture go in as they are encoded, without a second loss, and the
 material says that light is in the picture already (KHR_materials_unlit).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,6 @@ from alice_survey.core.run import progress
 from reconstruct.mesh.texture import Textured, read_page, remap
 from reconstruct.mesh.topology import face_normals, vertex_normals
 from reconstruct.mesh.visibility import ray_scene
-from reconstruct.ply import VERTEX, write_ply
 
 _LINEAR, _MIPMAPS, _CLAMP = 9729, 9987, 33071
 _UNLIT = "KHR_materials_unlit"
@@ -30,22 +29,6 @@ _ELEVATION_DEG, _AZIMUTH_DEG = 40.0, 200.0
 """Of the eye over the horizon, and where it stands, from north over east."""
 _ROWS = 128
 _BACK = 255.0
-
-
-def write_mesh(
-    folder: Path, mesh: Textured, extras: dict[str, Any], comments: Sequence[str]
-) -> None:
-    """Write `mesh.glb`, `mesh.obj` with `mesh.mtl`, and `mesh.ply` next to the pages.
-
-    Args:
-        folder: of the pages, which exist.
-        mesh: what is written.
-        extras: JSON values for the GLB.
-        comments: lines for the headers of the others.
-    """
-    write_glb(folder / "mesh.glb", mesh, extras)
-    _write_obj(folder / "mesh.obj", mesh, comments)
-    _write_ply(folder / "mesh.ply", mesh, comments)
 
 
 def write_glb(path: Path, mesh: Textured, extras: dict[str, Any]) -> None:
@@ -105,37 +88,36 @@ def write_glb(path: Path, mesh: Textured, extras: dict[str, Any]) -> None:
         temporary.write_bytes(content)
 
 
-def _write_obj(path: Path, mesh: Textured, comments: Sequence[str]) -> None:
-    """Write OBJ and, next to it, MTL that names the pages; x east, y north, z up."""
+def write_obj(
+    path: Path, glb: Path, places: Callable[[Array], Array], comments: Sequence[str]
+) -> None:
+    """Write what a file of `write_glb` holds as OBJ, and next to it MTL and the pages.
+
+    Args:
+        path: of the OBJ.
+        glb: to read.
+        places: takes vertices (V, 3), east, north, up, to what is written.
+        comments: lines for the header.
+    """
+    import trimesh
+
+    scene, first = trimesh.load_scene(glb, process=False), 1
     material = path.with_suffix(".mtl")
-    with atomic_path(material) as temporary:
-        temporary.write_text(
-            "".join(
-                f"newmtl {page.stem}\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nillum 0\nmap_Kd {page.name}\n"
-                for page in mesh.pages
-            )
-        )
-    with atomic_path(path) as temporary, temporary.open("w") as file:
-        file.writelines(f"# {line}\n" for line in comments)
+    with path.open("w") as file, material.open("w") as materials:
+        file.writelines(f"# {line}\n" for line in [*comments])
         file.write(f"mtllib {material.name}\n")
-        np.savetxt(file, mesh.vertices, fmt="v %.8g %.8g %.8g")
-        np.savetxt(file, mesh.uv, fmt="vt %.7g %.7g")
-        for number, page in enumerate(mesh.pages):
-            wedge = mesh.wedges.triangles[mesh.page == number]
-            both = np.stack([mesh.wedges.vertex[wedge], wedge], axis=2).reshape(-1, 6) + 1
-            file.write(f"usemtl {page.stem}\n")
-            np.savetxt(file, both, fmt="f %d/%d %d/%d %d/%d")
-
-
-def _write_ply(path: Path, mesh: Textured, comments: Sequence[str]) -> None:
-    """Write a binary PLY with normals and colours at vertices; x east, y north, z up."""
-    triangles = mesh.wedges.vertex[mesh.wedges.triangles].astype(np.int32)
-    record = np.empty(len(mesh.vertices), VERTEX)
-    normals = vertex_normals(mesh.vertices, triangles)
-    for axis, name in enumerate("xyz"):
-        record[name], record[f"n{name}"] = mesh.vertices[:, axis], normals[:, axis]
-    record["red"], record["green"], record["blue"] = mesh.colours.T
-    write_ply(path, [record], comments, triangles)
+        for name, part in scene.geometry.items():
+            page = path.with_name(f"{name}.jpg")
+            part.visual.material.baseColorTexture.save(page, quality="keep", subsampling="keep")
+            materials.write(f"newmtl {name}\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nillum 0\n")
+            materials.write(f"map_Kd {page.name}\n")
+            file.write(f"usemtl {name}\n")
+            enu = part.vertices[:, [0, 2, 1]] * [1.0, -1.0, 1.0]
+            np.savetxt(file, places(enu), fmt="v %.8g %.8g %.8g")
+            np.savetxt(file, part.visual.uv, fmt="vt %.7g %.7g")
+            corners = np.repeat(part.faces + first, 2, axis=1)
+            np.savetxt(file, corners, fmt="f %d/%d %d/%d %d/%d")
+            first += len(enu)
 
 
 @progress.step("draw the mesh")

@@ -11,9 +11,9 @@ from alice_survey.core.errors import warn
 from alice_survey.core.executor import Executor
 from alice_survey.core.records import CloudRecord, MeshRecord
 from alice_survey.core.run import progress
-from reconstruct.dense.cloud import frame_comments
+from reconstruct.dense.cloud import cloud_in_parts
 from reconstruct.light.solve import read_light
-from reconstruct.mesh.formats import GLB_AXES, render_oblique, write_mesh
+from reconstruct.mesh.formats import GLB_AXES, render_oblique, write_glb
 from reconstruct.mesh.surface import TriangleMesh, coarser_level, mesh_cloud
 from reconstruct.mesh.texture import MeshSetup, Textured, make_texture
 from reconstruct.mesh.tiles import TileSetup, write_tiles
@@ -37,16 +37,16 @@ def run_mesh(
     dense = workspace / "dense"
     about = CloudRecord.read(dense / "cloud.json")
     light = read_light(dense / "light.json")
+    scratch = folder / "scratch"
+    scratch.mkdir()
     setup = MeshSetup(
         workspace=workspace,
-        cloud=open_cloud(dense / "cloud.ply"),
+        cloud=open_cloud(cloud_in_parts(dense, scratch, model.frame)),
         offset=np.array(about.offset_east_north_up),
         step=about.thinned_to,
         pixel=mean_pixel(model),
     )
     views = [view for view in model.views if view.image in light.gains]
-    scratch = folder / "scratch"
-    scratch.mkdir()
     error = reconstruct.mesh_error_px * setup.pixel
     mesh, levels = mesh_cloud(setup.cloud, setup.step, error, scratch, executor)
     textured = make_texture(setup, folder, mesh.vertices, mesh.triangles, views, light, executor)
@@ -62,17 +62,17 @@ def run_mesh(
             f"only {facts['textured_share']:.0%} of the mesh is seen whole by a picture; the rest "
             "has the colours of the cloud"
         )
-    _write_results(folder, textured, facts, frame_comments(model.frame, setup.offset.tolist()))
+    _write_results(folder, textured, facts)
 
 
 @progress.step("write the mesh")
-def _write_results(
-    folder: Path, mesh: Textured, facts: dict[str, Any], comments: list[str]
-) -> None:
-    """Write `mesh.glb`, `.obj`, `.mtl`, `.ply`, `.json` and `.png` next to the pages."""
-    write_mesh(folder, mesh, {**facts, "axes": GLB_AXES}, comments)
+def _write_results(folder: Path, mesh: Textured, facts: dict[str, Any]) -> None:
+    """Write `mesh.glb`, `mesh.json` and `mesh.png`, and drop the pages, which the GLB has."""
+    write_glb(folder / "mesh.glb", mesh, {**facts, "axes": GLB_AXES})
     MeshRecord.save(folder / "mesh.json", facts)
     write_png(folder / "mesh.png", render_oblique(mesh))
+    for page in mesh.pages:
+        page.unlink()
 
 
 def mesh_facts(
@@ -86,7 +86,7 @@ def mesh_facts(
         "triangles": len(mesh.triangles),
         "area": round(float(area.sum()), 6),
         "textured_share": round(float(area[textured.label >= 0].sum() / area.sum()), 6),
-        "pages": [page.name for page in textured.pages],
+        "pages": len(textured.pages),
         "texture_scale": round(textured.scale, 6),
         "decimation_error": mesh.error,
         "unit": frame.unit,

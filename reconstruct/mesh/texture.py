@@ -59,8 +59,6 @@ class Textured:
     page: NDArray[np.int32]
     """(T,) page of every face."""
     pages: tuple[Path, ...]
-    colours: NDArray[np.uint8]
-    """(V, 3) RGB."""
     label: NDArray[np.int32]
     """(T,) view of every face, negative where no view sees it."""
     scale: float
@@ -153,15 +151,9 @@ def make_texture(
     for _ in executor.map(work, tasks, label="paint"):
         pass
     on_page = atlas.place(pixels, wedges.chart)
-    pages, colours = [], np.zeros((len(vertices), 3))
-    weight = np.zeros(len(vertices))
+    pages = []
     for number, (path, size) in enumerate(zip(scratch, atlas.sizes, strict=True)):
         picture = np.array(np.memmap(path, np.uint8, "r", shape=(size[1], size[0], 3)))
-        mine = np.flatnonzero(atlas.page[wedges.chart] == number)
-        at = np.floor(on_page[mine]).astype(np.intp)
-        smooth = cv2.blur(picture, (3, 3))[at[:, 1], at[:, 0], ::-1].astype(np.float64)
-        np.add.at(colours, wedges.vertex[mine], smooth)
-        np.add.at(weight, wedges.vertex[mine], 1.0)
         pages.append(folder / f"texture_{number}.jpg")
         write_jpeg(pages[-1], picture)
         path.unlink()
@@ -171,7 +163,6 @@ def make_texture(
         uv=atlas.uv(on_page, wedges.chart),
         page=atlas.page[charts.chart],
         pages=tuple(pages),
-        colours=np.rint(colours / np.maximum(weight, 1.0)[:, None]).astype(np.uint8),
         label=charts.label,
         scale=atlas.scale,
     )

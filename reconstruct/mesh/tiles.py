@@ -276,7 +276,6 @@ def _of_page(mesh: Textured, number: int) -> Textured:
         uv=mesh.uv[used],
         page=np.zeros(len(flat.reshape(-1, 3)), np.int32),
         pages=(mesh.pages[number],),
-        colours=mesh.colours[kept],
         label=mesh.label[mesh.page == number],
     )
 
@@ -325,7 +324,6 @@ def bake_tile(setup: TileSetup, task: BakeTask) -> None:
         uv=atlas.uv(on_page, wedges.chart),
         page=np.zeros(len(mesh.triangles), np.int32),
         pages=(path,),
-        colours=np.zeros((len(mesh.vertices), 3), np.uint8),
         label=label,
         scale=atlas.scale,
     )

@@ -26,8 +26,9 @@ from rasterio.windows import Window
 from alice_survey.core.config import ReconstructConfig, WaterConfig
 from alice_survey.core.errors import ReconstructionError, warn
 from alice_survey.core.executor import Executor
-from alice_survey.core.records import MosaicRecord, PicturesRecord
+from alice_survey.core.records import CloudRecord, MosaicRecord, PicturesRecord
 from alice_survey.core.run import progress
+from reconstruct.dense.cloud import cloud_in_parts
 from reconstruct.dense.dem import fill_gaps
 from reconstruct.light.solve import joined_samples
 from reconstruct.mosaic.colour import ColourModel, solve_colour
@@ -230,6 +231,7 @@ def run_mosaic(
         workspace=workspace,
         model=model,
         scratch=scratch,
+        cloud=cloud_in_parts(workspace / "dense", scratch, model.frame),
         facts=facts,
         references=references,
         water=sea,
@@ -260,6 +262,8 @@ class Painting:
     model: SparseModel
     """In the world."""
     scratch: Path
+    cloud: Path
+    """PLY of the surface's points."""
     facts: Sequence[PictureMeasures]
     references: Sequence[ReferencePatch]
     water: Water | None
@@ -294,10 +298,9 @@ def paint_plane(painting: Painting, plane: Plane, dem: Path, folder: Path) -> bo
     names = [view.image for view in model.views]
     outline = partial(outline_view, dem, sights, heights)
     label = partial(_label, plane)
-    dense = painting.workspace / "dense"
-    find_occluders(
-        dense, plane, dem, occluders_folder(sights), executor, label("find what hides the surface")
-    )
+    spacing = CloudRecord.read(painting.workspace / "dense" / "cloud.json").thinned_to
+    find = partial(find_occluders, painting.cloud, spacing, plane, dem, occluders_folder(sights))
+    find(executor, label("find what hides the surface"))
     outlines = list(
         executor.map(outline, model.views, label=label("outline pictures"), task_mib=_TASK_MIB)
     )

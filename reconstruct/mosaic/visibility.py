@@ -22,7 +22,6 @@ from alice_survey.core.artefacts import atomic_path
 from alice_survey.core.compiled import compiled
 from alice_survey.core.executor import Executor
 from alice_survey.core.frames import Array
-from alice_survey.core.records import CloudRecord
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from camera_calib.water import CHANNELS, channel_cameras
 from reconstruct.mosaic.grid import Float32, footprints, height_at_pixels
@@ -88,12 +87,19 @@ class Occluders:
 
 
 def find_occluders(
-    dense: Path, plane: Plane, dem: Path, folder: Path, executor: Executor, label: str
+    cloud: Path,
+    spacing: float,
+    plane: Plane,
+    dem: Path,
+    folder: Path,
+    executor: Executor,
+    label: str,
 ) -> None:
     """Write the points of a surface that are off the heights of a plane.
 
     Args:
-        dense: folder of the cloud.
+        cloud: PLY of its points.
+        spacing: of them.
         plane: whose heights.
         dem: they.
         folder: to write to.
@@ -104,10 +110,8 @@ def find_occluders(
         WorkspaceError: the cloud is missing or damaged.
     """
     folder.mkdir()
-    record = CloudRecord.read(dense / "cloud.json")
-    header = read_header(dense / "cloud.ply")
-    parts = range(-(-header.count // _PART))
-    find = partial(_off_heights, dense / "cloud.ply", plane, dem, folder)
+    parts = range(-(-read_header(cloud).count // _PART))
+    find = partial(_off_heights, cloud, plane, dem, folder)
     found = executor.map(find, parts, label=label, task_mib=_TASK_MIB)
     kept = [(number, *sphere) for number, sphere in enumerate(found) if sphere is not None]
     with atomic_path(folder / "index.npz") as temporary, temporary.open("wb") as file:
@@ -116,7 +120,7 @@ def find_occluders(
             numbers=np.array([number for number, *_ in kept], np.int64),
             centres=np.array([centre for _, centre, _ in kept]).reshape(-1, 3),
             radii=np.array([radius for *_, radius in kept]),
-            spacing=np.array(record.thinned_to),
+            spacing=np.array(spacing),
         )
 
 

@@ -245,9 +245,9 @@ class ReconstructCommand(DeviceCommand):
         None, "Plane of DEM and mosaic, any number: level, auto (the best one), or 'NAME=facing "
         "DEGREES tilt DEGREES': where the surface faces, and its lean back.",
     )  # fmt: skip
-    export: Literal["undistorted"] | None = option(
+    export: Literal["undistorted", "ply-obj"] | None = option(
         None, "Then write for other programs: pictures without refraction and distortion, with "
-        "the COLMAP model.",
+        "the COLMAP model; or the cloud as PLY and the mesh as OBJ.",
     )  # fmt: skip
     crs: str | None = option(
         None, "Then write rasters, cloud and mesh in this projected system too.",
@@ -277,9 +277,12 @@ class ReconstructCommand(DeviceCommand):
             changes = {"reconstruct": {"planes": self.plane}}
             text, values = run(self.stages(), self.workspace, self.survey, executor, changes)
             if self.export is not None:
-                from reconstruct.export import export_undistorted
+                from reconstruct.export import export_copies, export_undistorted
 
-                more, values[self.export] = export_undistorted(self.workspace, executor)
+                if self.export == "undistorted":
+                    more, values[self.export] = export_undistorted(self.workspace, executor)
+                else:
+                    more, values[self.export] = export_copies(self.workspace)
                 text = f"{text}\n{more}"
         if self.crs is not None:
             from reconstruct.export import export_projected

@@ -1,13 +1,17 @@
+from pathlib import Path
+
 import laspy
 import numpy as np
+import pytest
 
 from alice_survey.core.artefacts import read_json
 from alice_survey.core.executor import SERIAL
 from reconstruct.dense import cloud as cloud_module
-from reconstruct.dense.cloud import VERTEX, vertices_of, write_cloud, write_clouds
+from reconstruct.dense.cloud import VERTEX, cloud_in_parts, vertices_of, write_cloud, write_clouds
 from reconstruct.dense.surface_points import SURFACE_POINT
 from reconstruct.dense.surface_tiles import SurfaceTile
 from reconstruct.dense.view_store import ViewStore
+from reconstruct.ply import open_cloud
 from tests.oracles_dense import FRAME
 
 
@@ -72,6 +76,25 @@ def test_ply_is_read_back_by_another_library(tmp_path):
     assert "comment offset_east_north_up 1.0 2.0 -12.0\n" in header
     assert VERTEX.itemsize * count < (tmp_path / "cloud.ply").stat().st_size
     assert list(tmp_path.iterdir()) == [tmp_path / "cloud.ply"]
+
+
+@pytest.mark.parametrize("cell", [0.05, 3e-4])
+def test_points_of_the_copc_are_those_of_the_surface(tmp_path: Path, cell: float):
+    surface = random_surface()
+    surface["enu"] *= np.float32(cell / 0.05)
+    store = ViewStore(tmp_path / "scratch")
+    store.save(0, "surface", surface)
+    whole = SurfaceTile(number=0, count=len(surface), corners_enu=np.empty((8, 3)), bounds={})
+    write_clouds(tmp_path, store, [whole], (1.0, 2.0, -12.0), FRAME, cell, SERIAL)
+    assert not (tmp_path / "cloud.ply").exists()
+    (tmp_path / "copy").mkdir()
+    found = open_cloud(cloud_in_parts(tmp_path, tmp_path / "copy", FRAME))
+    expected = vertices_of(surface, cell, cell)
+    points, expected = (np.sort(rows, order="sigma") for rows in (found.header.rows(), expected))
+    for name in expected.dtype.names:
+        limit = 0.06 * cell if name in "xyz" else 0.0
+        np.testing.assert_allclose(points[name], expected[name], rtol=0, atol=limit)
+    assert found.header.offset.tolist() == [1.0, 2.0, -12.0]
 
 
 def test_the_overview_is_thinned_and_the_copc_is_not(tmp_path, monkeypatch):

@@ -12,12 +12,15 @@ from alice_survey.core.artefacts import read_json, write_json
 from alice_survey.core.config import ReconstructConfig, SurveyConfig
 from alice_survey.core.executor import SERIAL
 from reconstruct.dense.cloud import VERTEX, write_cloud, write_cloud_json
+from reconstruct.evaluate.scores import read_mesh
+from reconstruct.export import export_copies
 from reconstruct.light.solve import GRID, LightModel, write_light
 from reconstruct.mesh.atlas import pack
 from reconstruct.mesh.cells import decimate
 from reconstruct.mesh.surface import splat
 from reconstruct.mesh.texture import spread_corners
 from reconstruct.mesh.topology import edges_of
+from reconstruct.ply import read_ply_points
 from tests import oracles_dense
 from tests.engines import PicklingThreads
 from tests.oracles_mesh import boxes_overlap, implicit_value, spread_value
@@ -88,8 +91,17 @@ def mesh(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "mesh"
 
 
+def welded(mesh: Path) -> o3d.geometry.TriangleMesh:
+    """The mesh of a folder, east, north, up, joined where its texture was cut."""
+    ned, triangles = read_mesh(mesh)
+    enu = np.float32(ned[:, [1, 0, 2]] * [1, 1, -1] - OFFSET)
+    vertices, number = np.unique(enu, axis=0, return_inverse=True)
+    corners = o3d.utility.Vector3iVector(number.reshape(-1)[triangles])
+    return o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(vertices), corners)
+
+
 def test_surface_is_the_bump_with_its_hole_and_no_other(mesh: Path):
-    read = o3d.io.read_triangle_mesh(str(mesh / "mesh.ply"))
+    read = welded(mesh)
     assert read.is_edge_manifold() and read.is_vertex_manifold() and read.is_orientable()
     v = np.asarray(read.vertices)
     miss = v[:, 2] + OFFSET[2] + bump(v[:, 1], v[:, 0])
@@ -120,8 +132,26 @@ def test_texture_shows_the_coordinates_of_the_surface(mesh: Path):
         worst.append(np.abs(shown - oracles_dense.position_code(north, east)).max(axis=1))
     miss = np.concatenate(worst)
     assert np.median(miss) < 6 and np.percentile(miss, 95) < 25  # 2 levels a millimetre
-    obj = trimesh.load(mesh / "mesh.obj")
-    assert len(obj.faces) == read_json(mesh / "mesh.json")["triangles"]
+
+
+def test_copies_hold_what_the_mesh_holds(mesh: Path):
+    """GLB alone by default; OBJ on request, in the place and with the texture of the GLB."""
+    assert {path.name for path in mesh.iterdir()} == {
+        "mesh.glb", "mesh.json", "mesh.png", "stage.json",
+    }  # fmt: skip
+    export_copies(mesh.parent)
+    copies = mesh.parent / "ply-obj"
+    glb, obj = trimesh.load_scene(mesh / "mesh.glb"), trimesh.load_scene(copies / "mesh.obj")
+    assert len(glb.geometry) == len(obj.geometry)
+    for one, other in zip(glb.geometry.values(), obj.geometry.values(), strict=True):
+        enu = other.vertices[other.faces]
+        assert np.abs(one.vertices[one.faces][..., [0, 2, 1]] * [1, -1, 1] - enu).max() < 1e-6
+        assert np.abs(one.visual.uv[one.faces] - other.visual.uv[other.faces]).max() < 1e-6
+        pages = one.visual.material.baseColorTexture, other.visual.material.image
+        shown = [np.asarray(page.convert("RGB"), float) for page in pages]
+        assert np.abs(shown[0] - shown[1]).mean() < 0.1
+    cloud = read_ply_points(copies / "cloud.ply", 10**9)
+    assert len(cloud) == read_json(mesh.parent / "dense" / "cloud.json")["points"]
 
 
 def test_kernels_do_what_their_twins_do():

@@ -23,7 +23,7 @@ from reconstruct.mesh.surface import coarser_level, finest_level
 from reconstruct.mesh.topology import edges_of
 from reconstruct.ply import open_cloud
 from tests.oracles_dense import DATUM, FRAME, position_code
-from tests.reconstruct.mesh.test_run import OFFSET, STEP_M, bump, make_workspace
+from tests.reconstruct.mesh.test_run import OFFSET, STEP_M, bump, make_workspace, welded
 
 pytestmark = pytest.mark.slow
 PAGE_PX = 512
@@ -134,7 +134,7 @@ def spread(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
 
 def test_finest_tiles_are_the_surface_once(survey: Path, tiles: list[Tile]):
-    read = o3d.io.read_triangle_mesh(str(survey / "mesh" / "mesh.ply"))
+    read = welded(survey / "mesh")
     leaves = [tile for tile in tiles if tile.level == 0]
     areas = (trimesh.Trimesh(t.enu, t.triangles, process=False).area for t in leaves)
     assert sum(areas) == pytest.approx(read.get_surface_area(), rel=0.01)

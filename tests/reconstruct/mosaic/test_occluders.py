@@ -1,6 +1,5 @@
 """Occluders off the heights of a plane, and what they hide from a view, in closed form."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -8,9 +7,10 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.executor import local_executor
+from reconstruct.dense.cloud import VERTEX
 from reconstruct.mosaic.visibility import Occluders, find_occluders, hidden_by, read_occluders
 from reconstruct.planes import LEVEL_PLANE
-from reconstruct.ply import VERTEX, write_ply
+from reconstruct.ply import write_ply
 from reconstruct.raster import DemGrid, tiled_raster
 from reconstruct.views.model import View
 from tests.oracles_dense import FRAME, PINHOLE, view_at
@@ -44,10 +44,6 @@ def occluders(tmp_path_factory: pytest.TempPathFactory) -> Occluders:
     for axis, values in zip("xyz", (points - offset).T, strict=True):
         records[axis] = values
     write_ply(folder / "cloud.ply", [records], ["offset_east_north_up 3.0 -2.0 -9.0"])
-    about = {
-        "points": len(points), "offset_east_north_up": offset.tolist(), "thinned_to": CELL_M,
-    }  # fmt: skip
-    (folder / "cloud.json").write_text(json.dumps(about))
     heights = np.full((400, 400), np.nan, np.float32)
     row, column = (200 - floor[:, 1] / CELL_M).astype(int), (floor[:, 0] / CELL_M + 200).astype(int)
     heights[row, column] = FLOOR_M
@@ -56,7 +52,13 @@ def occluders(tmp_path_factory: pytest.TempPathFactory) -> Occluders:
         raster.write(heights, 1)
     with local_executor().start() as executor:
         find_occluders(
-            folder, LEVEL_PLANE, folder / "dem.tif", folder / "found", executor, "find occluders"
+            folder / "cloud.ply",
+            CELL_M,
+            LEVEL_PLANE,
+            folder / "dem.tif",
+            folder / "found",
+            executor,
+            "find occluders",
         )
     return read_occluders(folder / "found")
 

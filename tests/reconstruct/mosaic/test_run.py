@@ -11,11 +11,10 @@ from alice_survey.core.config import CameraConfig, ReconstructConfig, SurveyConf
 from alice_survey.core.executor import SERIAL
 from camera_calib.approximation.pinhole_warp import best_warp
 from camera_calib.rig import design_rig
-from reconstruct.dense.cloud import write_cloud, write_cloud_json
+from reconstruct.dense.cloud import VERTEX, write_cloud, write_cloud_json
 from reconstruct.mosaic import run
 from reconstruct.mosaic.picture_measures import encode_srgb, linear_table
 from reconstruct.mosaic.run import _dispersion
-from reconstruct.ply import VERTEX
 from reconstruct.raster import DemGrid, tiled_raster
 from reconstruct.views.model import View
 from tests.cameras import changed
