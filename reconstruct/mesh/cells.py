@@ -23,6 +23,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from alice_survey.core.compiled import compiled
 from alice_survey.core.executor import Executor
@@ -86,9 +87,10 @@ def decimate(
         able = np.flatnonzero(cost <= largest)
         if not len(able):
             break
-        order = able[np.argsort(cost[able], kind="stable")]
-        corners = np.argsort(faces.reshape(-1), kind="stable")
-        starts = np.cumsum(np.bincount(faces.reshape(-1) + 1, minlength=len(place) + 1))
+        rank = np.sqrt(cost[able] / (largest or 1.0)) * np.iinfo(np.uint16).max
+        order = able[np.argsort(rank.astype(np.uint16), kind="stable")]
+        at = faces.reshape(-1), np.arange(faces.size, dtype=np.int32) // 3
+        around = csr_array((np.ones(faces.size, np.int8), at), (len(place), len(faces)))
         gone = _collapse(
             place,
             faces,
@@ -96,8 +98,8 @@ def decimate(
             edges[order],
             target_place[order],
             rim_edge[order],
-            starts,
-            corners // 3,
+            around.indptr,
+            around.indices,
         )
         faces = np.ascontiguousarray(faces[faces[:, 0] >= 0])
         used = np.zeros(len(place), np.bool_)
@@ -211,7 +213,7 @@ def _normal(a: Array, b: Array, c: Array, out: Array) -> float:
 def _turns_or_thins(
     place: Array,
     faces: NDArray[np.int32],
-    ring: NDArray[np.int64],
+    ring: NDArray[np.int32],
     moving: int,
     other: int,
     target_place: Array,
@@ -247,8 +249,8 @@ def _collapse(
     edges: NDArray[np.int64],
     target_place: Array,
     rim_edge: NDArray[np.bool_],
-    starts: NDArray[np.int64],
-    around: NDArray[np.int64],
+    starts: NDArray[np.int32],
+    around: NDArray[np.int32],
 ) -> int:
     """Collapse edges in order, in place, no two of one vertex; returns how many.
 
@@ -451,10 +453,12 @@ def decimate_cell(
 
 def without_pairs(triangles: Triangles) -> Triangles:
     """Without triangles back to back, which two cells make where both cut the same corner off."""
-    _, group, count = np.unique(
-        np.sort(triangles, axis=1), axis=0, return_inverse=True, return_counts=True
-    )
-    return np.asarray(triangles[count[group.reshape(-1)] == 1])
+    low, middle, high = np.sort(triangles, axis=1).T
+    order = np.lexsort((high, middle, low))
+    same = (np.diff(np.stack([low, middle, high])[:, order]) == 0).all(axis=0)
+    alone = np.ones(len(triangles), np.bool_)
+    alone[order[1:][same]] = alone[order[:-1][same]] = False
+    return np.asarray(triangles[alone])
 
 
 def farthest(points: Array, vertices: Array, triangles: Triangles) -> float:
