@@ -151,8 +151,8 @@ def _plane(normal: Array, offset: Array) -> Array:
 
 
 def quadric_errors(q: Array, p: Array) -> Array:
-    """(N,) sums of weighted squared distances of points (N, 3) from the planes of quadrics."""
-    (x, y, z), q = p.T, q.T
+    """(N,) sums of weighted squared distances of points (3, N) from planes of quadrics (11, N)."""
+    x, y, z = p
     total: Array = (
         q[0] * x * x + q[4] * y * y + q[7] * z * z + q[9]
         + 2.0 * (q[1] * x * y + q[2] * x * z + q[3] * x + q[5] * y * z + q[6] * y + q[8] * z)
@@ -161,15 +161,14 @@ def quadric_errors(q: Array, p: Array) -> Array:
 
 
 def best_points(q: Array) -> Array:
-    """(N, 3) points of least error of quadrics (N, 11); NaN where the planes leave it open."""
-    a, b, c, g, d, e, h, f, i = q.T[:9]
+    """(3, N) points of least error of quadrics (11, N); NaN where the planes leave it open."""
+    a, b, c, g, d, e, h, f, i = q[:9]
     m0, m1, m2 = d * f - e * e, c * e - b * f, b * e - c * d
     m4, m5, m8 = a * f - c * c, b * c - a * e, a * d - b * b
     determinant = a * m0 + b * m1 + c * m2
     known = determinant > 1e-3 * ((a + d + f) / 3.0) ** 3
     sums = m0 * -g + m1 * -h + m2 * -i, m1 * -g + m4 * -h + m5 * -i, m2 * -g + m5 * -h + m8 * -i
-    points: Array = np.array(sums) / np.where(known, determinant, np.nan)
-    return points.T
+    return np.asarray(np.array(sums) / np.where(known, determinant, np.nan))
 
 
 def _costs(
@@ -187,17 +186,18 @@ def _costs(
     a, b = edges.T
     keep_a, keep_b = fixed[a] | (rim[a] & ~rim[b]), fixed[b] | (rim[b] & ~rim[a])
     able = ~(keep_a & keep_b) & (rim_edge | ~(rim[a] & rim[b]))
-    q, apart = quadrics[a] + quadrics[b], place[a] - place[b]
-    length2 = apart[:, 0] ** 2 + apart[:, 1] ** 2 + apart[:, 2] ** 2
+    q, first, second = (
+        np.ascontiguousarray(rows.T) for rows in (quadrics[a] + quadrics[b], place[a], place[b])
+    )
+    length2 = np.square(first - second).sum(axis=0)
     turned = able & keep_b
     edges[turned] = edges[turned][:, ::-1]
-    middle, target = 0.5 * (place[a] + place[b]), best_points(q)
-    off = target - middle
-    near = off[:, 0] ** 2 + off[:, 1] ** 2 + off[:, 2] ** 2 <= length2
-    target = np.where(near[:, None], target, middle)
-    target = np.where((keep_a | keep_b)[:, None], place[edges[:, 0]], target)
-    cost = quadric_errors(q, target) / np.maximum(q[:, 10], 1e-30) + _SHORTNESS * length2
-    return np.where(able, cost, np.inf), target
+    middle, target = 0.5 * (first + second), best_points(q)
+    near = np.square(target - middle).sum(axis=0) <= length2
+    target = np.where(near, target, middle)
+    target = np.where(keep_a, first, np.where(keep_b, second, target))
+    cost = quadric_errors(q, target) / np.maximum(q[10], 1e-30) + _SHORTNESS * length2
+    return np.where(able, cost, np.inf), np.ascontiguousarray(target.T)
 
 
 @compiled
