@@ -99,21 +99,20 @@ def _mutual(
     """As `match_descriptors`, where some rows of a are compared with some of b, in turn."""
     if not len(a) or len(b) < 2:
         return np.zeros((0, 2), np.uint32)
-    right = b.astype(np.float32)
-    norms_b = (right**2).sum(axis=1)
+    left, right = a.astype(np.float32), b.astype(np.float32)
+    norms_a, norms_b = ((side**2).sum(axis=1) for side in (left, right))
     best = np.zeros(len(a), np.int64)
     first = np.full(len(a), np.inf, np.float32)
     second = np.full(len(a), np.inf, np.float32)
     best_b = np.full(len(b), -1, np.int64)
     nearest_b = np.full(len(b), np.inf, np.float32)
     for rows, near in searches:
-        left = a[rows].astype(np.float32)
         own_best, own_best_b = np.zeros(len(rows), np.int64), best_b[near]
         own_first, own_second = first[rows], second[rows]
         own_nearest = nearest_b[near]
         before = own_nearest.copy()
         _best_two(
-            left @ right[near].T, (left**2).sum(axis=1), norms_b[near], own_best, own_first,
+            left[rows] @ right[near].T, norms_a[rows], norms_b[near], own_best, own_first,
             own_second, own_best_b, own_nearest,
         )  # fmt: skip
         best[rows], first[rows], second[rows] = near[own_best], own_first, own_second
@@ -154,12 +153,15 @@ def match_near(
     number = cells[:, 1] * (cells[:, 0].max() + 1) + cells[:, 0]
     order = np.argsort(number, kind="stable")
 
+    starts = np.flatnonzero(np.diff(number[order], prepend=-1))
+    low = np.minimum.reduceat(predicted[order], starts) - radius_px
+    high = np.maximum.reduceat(predicted[order], starts) + radius_px
+    first, last = np.searchsorted(x, low[:, 0]), np.searchsorted(x, high[:, 0], "right")
+
     def searches() -> Iterator[tuple[NDArray[np.intp], NDArray[np.intp]]]:
-        for rows in np.split(order, np.flatnonzero(np.diff(number[order])) + 1):
-            low, high = predicted[rows].min(axis=0), predicted[rows].max(axis=0)
-            low, high = low - radius_px, high + radius_px
-            strip = slice(np.searchsorted(x, low[0], "left"), np.searchsorted(x, high[0], "right"))
-            near = np.sort(across[strip][(y[strip] >= low[1]) & (y[strip] <= high[1])])
+        for n, rows in enumerate(np.split(order, starts[1:])):
+            strip = slice(first[n], last[n])
+            near = np.sort(across[strip][(y[strip] >= low[n, 1]) & (y[strip] <= high[n, 1])])
             if len(near):
                 yield rows, near
 
