@@ -521,7 +521,7 @@ def parse_picks(points: str, sigma_px: float = 0.0) -> list[tuple[Pick, ...]]:
             )
         )  # fmt: skip
     if len(found) < 2:
-        raise ReconstructionError(f"{len(found)} points; two or more are needed to measure")
+        raise ReconstructionError(f"{len(found)} of at least two points are given")
     return found
 
 

@@ -304,9 +304,9 @@ class MeasureCommand(WorkspaceCommand, ReportCommand):
         "measure reef --points 'left/000012.png:301,255 left/000012.png:640,270' --json",
         "measure reef --polygons colonies.gpkg --label species -o colonies.csv",
     )
-    points: str | None = option(
-        None, "Two or more pixels: 'IMAGE:x,y', or 'IMAGE:x,y=IMAGE:x,y' where two pictures show "
-        "the point.",
+    points: list[str] | None = option(
+        None, "Two or more pixels in quotes, or one each time: 'IMAGE:x,y IMAGE:x,y', or "
+        "IMAGE:x,y=IMAGE:x,y where two pictures show the point.", metavar="POINTS",
     )  # fmt: skip
     polygons: Path | None = option(
         None, "Measure the polygons of a file: GeoJSON, GeoPackage, shapefile or KML.",
@@ -333,7 +333,7 @@ class MeasureCommand(WorkspaceCommand, ReportCommand):
             )  # fmt: skip
         from reconstruct.picking.lengths import measure
 
-        return measure(self.workspace, self.points or "", pick_sigma_px=self.pick_sigma)
+        return measure(self.workspace, " ".join(self.points or ()), pick_sigma_px=self.pick_sigma)
 
 
 class ControlCommand(WorkspaceCommand, ThreadsCommand, ReportCommand):
@@ -355,10 +355,9 @@ class ControlCommand(WorkspaceCommand, ThreadsCommand, ReportCommand):
     dictionary: str | None = option(
         None, "Dictionary of the coded markers; without it all are tried (slow).", metavar="NAME"
     )
-    points: str | None = option(
-        None, "Two points of a known distance, each as IMAGE:x,y or, in two pictures, as "
-        "IMAGE:x,y=IMAGE:x,y.",
-        metavar="POINTS",
+    points: list[str] | None = option(
+        None, "Two points of a known distance, in quotes or one each time: 'IMAGE:x,y IMAGE:x,y' "
+        "or, in two pictures, IMAGE:x,y=IMAGE:x,y.", metavar="POINTS",
     )  # fmt: skip
     length: float | None = option(
         None, "Distance between the two points of --points.", metavar="METRES", ge=1e-6
@@ -375,7 +374,7 @@ class ControlCommand(WorkspaceCommand, ThreadsCommand, ReportCommand):
             )
         if self.points is None or self.length is None:
             raise typer.BadParameter("--points and --length go together: give both, or neither")
-        text = scale_model(self.workspace, self.points, self.length)
+        text = scale_model(self.workspace, " ".join(self.points), self.length)
         return text, {"text": text}
 
 

@@ -1,12 +1,15 @@
 """The paper's single station: one stereo pair is a workspace, and lengths in it have sigmas."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from alice_survey.app.cli.main import app
 from alice_survey.app.pipeline import run
 from alice_survey.core.errors import ImageError, ReconstructionError
 from alice_survey.core.frames import Array
@@ -60,6 +63,9 @@ def test_lengths_of_one_station_are_as_far_off_as_their_sigmas_say(station: Path
     assert len(pixels) >= 36  # two pictures leave gaps
     words = " ".join(f"left/a.png:{x:.1f},{y:.1f}" for x, y in pixels - 0.5)  # as viewers count
     _, data = measure(station, words)
+    each = [word for point in words.split() for word in ("--points", point)]
+    said = CliRunner().invoke(app, ["measure", str(station), *each, "--json"])
+    assert json.loads(said.stdout) == json.loads(json.dumps(data)), said.output
     true = surface_points(rig.cameras["left"], rig.cam_from_rig["left"].inv(), pixels)
     lengths = np.linalg.norm(np.diff(true, axis=0), axis=1)
     found, own, shared = (
