@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.core.compiled import compiled
 from alice_survey.core.frames import Array
 from reconstruct.mesh.topology import Triangles
 from reconstruct.mesh.visibility import Charts
@@ -17,8 +16,8 @@ PADDING_PX = 8
 
 PAGE_PX = 8192
 """Largest side of a page."""
-_MAX_PAGES, _FILLED = 16, 0.85
-"""Pages of a mesh, and the share of a page that patches fill."""
+_MAX_PAGES, _FILLED, _SPARE = 16, 0.75, 0.08
+"""Pages of a mesh; the share of a page that patches fill, and what they mostly fill beyond."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -101,14 +100,13 @@ def make_pages(pixels: Array, wedges: Wedges, page: NDArray[np.int32] | None, co
         sizes = []
         for number in range(int(page.max(initial=-1)) + 1):
             mine = np.flatnonzero(page == number)
-            side = max(int(box[mine].max(initial=4)), math.isqrt(int(box[mine].prod(1).sum())))
+            area = int(box[mine].prod(1).sum() / (_FILLED + _SPARE))
+            side = max(int(box[mine].max(initial=4)), math.isqrt(area))
             side = -(-side // 4) * 4
-            while ((at := pack(box[mine], side)) < 0).any():
-                side = -(-math.ceil(1.05 * side) // 4) * 4
-            corner[mine] = at
+            corner[mine] = at = pack(box[mine], side)
             used = int((at[:, 1] + box[mine, 1]).max(initial=4))
             sizes.append((side, -(-used // 4) * 4))
-        widest = max((side for side, _ in sizes), default=0)
+        widest = max(map(max, sizes), default=0)
         if widest <= PAGE_PX:
             break
         scale *= 0.95 * PAGE_PX / widest
@@ -126,69 +124,21 @@ def _share_out(box: Array) -> NDArray[np.int32]:
 
 
 def pack(boxes: NDArray[np.int64], side: int) -> NDArray[np.int64]:
-    """Put boxes onto a square page along its skyline, tallest first, each as low as it goes.
+    """Put boxes into rows of a page, tallest first.
 
     Args:
         boxes: (C, 2) widths and heights.
-        side: of the page.
+        side: width of the page, and of the widest box at most.
 
     Returns:
-        Corner (C, 2) of every box, no two of which overlap; -1 of those that do not fit.
+        Corner (C, 2) of every box, no two of which overlap.
     """
     order = np.lexsort((np.arange(len(boxes)), -boxes[:, 0], -boxes[:, 1]))
     corner = np.empty((len(boxes), 2), np.int64)
-    corner[order] = _fill_page(boxes[order].astype(np.int64), side)
-    return corner
-
-
-@compiled
-def _fill_page(boxes: NDArray[np.int64], side: int) -> NDArray[np.int64]:
-    """Corners (C, 2) of boxes (C, 2), taken in their order; -1 of those that do not fit."""
-    corner = np.full(boxes.shape, -1, np.int64)
-    skyline = np.zeros((min(side, 2 * len(boxes)) + 3, 2), np.int64)
-    steps = int(np.int64(1))  # a literal has a type of its own
-    for box in range(len(boxes)):
-        width, height = boxes[box, 0], boxes[box, 1]
-        x, y = _lowest(skyline[:steps], width, side)
-        if x >= 0 and y + height <= side:
-            corner[box, 0], corner[box, 1] = x, y
-            steps = _raise(skyline, steps, x, x + width, y + height)
-    return corner
-
-
-@compiled
-def _lowest(skyline: NDArray[np.int64], width: int, side: int) -> tuple[int, int]:
-    """Leftmost of the lowest places for a width, and its level; -1 where none is wide enough."""
-    best, lowest = -1, 0
-    for first in range(len(skyline)):
-        x = skyline[first, 0]
+    x = y = below = 0
+    for box, (width, height) in zip(order.tolist(), boxes[order].tolist(), strict=True):
         if x + width > side:
-            break
-        level = 0
-        for step in range(first, len(skyline)):
-            if skyline[step, 0] >= x + width:
-                break
-            level = max(level, skyline[step, 1])
-        if best < 0 or level < lowest:
-            best, lowest = x, level
-    return best, lowest
-
-
-@compiled
-def _raise(skyline: NDArray[np.int64], steps: int, west: int, east: int, level: int) -> int:
-    """Bring what is between two places to a level, in place; how many steps there are then."""
-    first = 0
-    while skyline[first, 0] < west:
-        first += 1
-    last, under = first, skyline[first, 1]
-    while last < steps and skyline[last, 0] <= east:
-        under = skyline[last, 1]
-        last += 1
-    moved = steps - last
-    for k in range(moved):
-        step = moved - 1 - k if first + 2 > last else k  # none is written before it is read
-        skyline[first + 2 + step, 0] = skyline[last + step, 0]
-        skyline[first + 2 + step, 1] = skyline[last + step, 1]
-    skyline[first, 0], skyline[first, 1] = west, level
-    skyline[first + 1, 0], skyline[first + 1, 1] = east, under
-    return first + 2 + moved
+            x, y = 0, below
+        corner[box] = x, y
+        x, below = x + width, max(below, y + height)
+    return corner
