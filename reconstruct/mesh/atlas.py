@@ -16,8 +16,8 @@ PADDING_PX = 8
 
 PAGE_PX = 8192
 """Largest side of a page."""
-_MAX_PAGES, _FILLED, _SPARE = 16, 0.75, 0.08
-"""Pages of a mesh; the share of a page that patches fill, and what they mostly fill beyond."""
+_MAX_PAGES, _FILLED, _ROWS_FILLED = 16, 0.75, 0.83
+"""Pages of a mesh; shares of a page that patches may fill, and mostly fill in rows."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -100,7 +100,7 @@ def make_pages(pixels: Array, wedges: Wedges, page: NDArray[np.int32] | None, co
         sizes = []
         for number in range(int(page.max(initial=-1)) + 1):
             mine = np.flatnonzero(page == number)
-            area = int(box[mine].prod(1).sum() / (_FILLED + _SPARE))
+            area = int(box[mine].prod(1).sum() / _ROWS_FILLED)
             side = max(int(box[mine].max(initial=4)), math.isqrt(area))
             side = -(-side // 4) * 4
             corner[mine] = at = pack(box[mine], side)
