@@ -96,6 +96,7 @@ def welded(mesh: Path) -> o3d.geometry.TriangleMesh:
     ned, triangles = read_mesh(mesh)
     enu = np.float32(ned[:, [1, 0, 2]] * [1, 1, -1] - OFFSET)
     vertices, number = np.unique(enu, axis=0, return_inverse=True)
+
     corners = o3d.utility.Vector3iVector(number.reshape(-1)[triangles])
     return o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(vertices), corners)
 
@@ -136,9 +137,7 @@ def test_texture_shows_the_coordinates_of_the_surface(mesh: Path):
 
 def test_copies_hold_what_the_mesh_holds(mesh: Path):
     """GLB alone by default; OBJ on request, in the place and with the texture of the GLB."""
-    assert {path.name for path in mesh.iterdir()} == {
-        "mesh.glb", "mesh.json", "mesh.png", "stage.json",
-    }  # fmt: skip
+    assert {p.name for p in mesh.iterdir()} == {"mesh.glb", "mesh.json", "mesh.png", "stage.json"}
     export_copies(mesh.parent)
     copies = mesh.parent / "ply-obj"
     glb, obj = trimesh.load_scene(mesh / "mesh.glb"), trimesh.load_scene(copies / "mesh.obj")

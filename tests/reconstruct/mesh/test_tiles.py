@@ -170,10 +170,13 @@ def test_boxes_and_errors_of_tiles_hold_what_is_below(tiles: list[Tile]):
 def test_distance_bounds_that_from_the_finest_cells(levels: list[CellLevel], tiles: list[Tile]):
     fine = levels[0].whole()
     for number, level in enumerate(levels[1:], 1):
-        for (x, y), cell in level.cells.items():
+        farthest = []
+        for key, cell in level.cells.items():
             mesh = cell.mesh()
             away = distances(spread(mesh.vertices, mesh.triangles), fine.vertices, fine.triangles)
-            assert 0.1 * level.error < away.max() <= cell.distance < 20 * level.error, (x, y)
+            assert away.max() <= cell.distance < 20 * level.error, key
+            farthest.append(away.max())
+        assert max(farthest) > 0.1 * level.error  # where it is flat nothing moves
         worst, mesh = max(cell.distance for cell in level.cells.values()), level.whole()
         back = distances(spread(fine.vertices, fine.triangles), mesh.vertices, mesh.triangles)
         assert back.max() <= worst
