@@ -526,11 +526,12 @@ def _drop_cut_files(folder: Path) -> None:
 
 
 @contextlib.contextmanager
-def atomic_path(path: Path) -> Iterator[Path]:
+def atomic_path(path: Path, *, lasting: bool = True) -> Iterator[Path]:
     """A path to write to, next to `path`, that replaces it when all went well and is on the disk.
 
     Threads, processes and machines that write the same file each get a path of their own: the last
-    one that finishes is kept, whole.
+    one that finishes is kept, whole. What need not survive a power cut, since no run would go on
+    from it, is not lasting and does not wait for the disk.
 
     Raises:
         WorkspaceError: there is a folder of that name.
@@ -541,9 +542,11 @@ def atomic_path(path: Path) -> Iterator[Path]:
     temporary = path.with_name(f".{path.stem}.tmp{os.urandom(6).hex()}{path.suffix}")
     try:
         yield temporary
-        sync(temporary)
+        if lasting:
+            sync(temporary)
         temporary.replace(path)
-        sync(path.parent)
+        if lasting:
+            sync(path.parent)
     except OSError as error:
         if error.filename is None:  # of a write to a file that is open
             error.filename = str(path)

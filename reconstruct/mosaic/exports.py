@@ -214,7 +214,7 @@ def _write_tile(raster: rasterio.DatasetReader, window: Window, path: Path, kind
     bands = 3 if kind == "jpg" else 4
     shared = {"width": window.width, "height": window.height, "dtype": "uint8"}
     known = 0
-    with atomic_path(path.with_suffix(".rough.tif")) as rough:
+    with atomic_path(path.with_suffix(".rough.tif"), lasting=False) as rough:
         with rasterio.open(
             rough, "w", driver="GTiff", count=bands, crs=raster.crs, transform=transform,
             photometric="RGB", tiled=True, compress="deflate", zlevel=1, bigtiff="if_safer",

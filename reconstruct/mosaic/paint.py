@@ -295,7 +295,7 @@ def label_block(task: PaintTask) -> Labels:
         known = chosen >= 0
         taken = np.take_along_axis(number, np.maximum(chosen, 0)[..., None], axis=2)[..., 0]
         label = np.where(known, taken + 1, 0).astype(np.int32)
-    with atomic_path(label_path_of_core(task.survey, block.core)) as path:
+    with atomic_path(label_path_of_core(task.survey, block.core), lasting=False) as path:
         np.save(path, label[inner])
     return Labels(
         block=block,

@@ -124,7 +124,7 @@ def measure_picture(workspace: Path, folder: Path, view: View) -> PictureMeasure
     content = np.dstack([levels, np.rint(255 * small[..., 3]).astype(np.uint8)])
     copy = _small_copy(content)
     path = _small_path(folder, view.image)
-    with atomic_path(path) as temporary, temporary.open("wb") as file:
+    with atomic_path(path, lasting=False) as temporary, temporary.open("wb") as file:
         np.save(file, copy.levels)
         np.save(file, copy.broad)
     green = taken[..., 1]

@@ -114,7 +114,10 @@ def find_occluders(
     find = partial(_off_heights, cloud, plane, dem, folder)
     found = executor.map(find, parts, label=label, task_mib=_TASK_MIB)
     kept = [(number, *sphere) for number, sphere in enumerate(found) if sphere is not None]
-    with atomic_path(folder / "index.npz") as temporary, temporary.open("wb") as file:
+    with (
+        atomic_path(folder / "index.npz", lasting=False) as temporary,
+        temporary.open("wb") as file,
+    ):
         np.savez(
             file,
             numbers=np.array([number for number, *_ in kept], np.int64),
@@ -383,7 +386,7 @@ def store_visible(folder: Path, view: View, dem: Float32, around: DemGrid) -> No
     corner = around.window(top, left, *cells.shape)
     path = visible_path(folder, view.image)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_path(path) as temporary, temporary.open("wb") as file:
+    with atomic_path(path, lasting=False) as temporary, temporary.open("wb") as file:
         np.savez_compressed(file, cells=cells, west=corner.west, north=corner.north)
 
 

@@ -256,6 +256,17 @@ def test_atomic_path_leaves_nothing_behind_on_failure(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
 
 
+@pytest.mark.parametrize(("lasting", "synced"), [(True, 2), (False, 0)])
+def test_scratch_does_not_wait_for_the_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lasting: bool, synced: int
+) -> None:
+    calls: list[int] = []
+    monkeypatch.setattr(os, "fsync", calls.append)
+    with atomic_path(tmp_path / "a.txt", lasting=lasting) as path:
+        path.write_text("whole")
+    assert len(calls) == synced and (tmp_path / "a.txt").read_text() == "whole"
+
+
 def test_csv_writes_unknown_values_as_empty_cells(tmp_path: Path) -> None:
     write_csv(tmp_path / "a.csv", ["x", "y"], [[1.5, float("nan")], [None, "t"]])
     assert (tmp_path / "a.csv").read_text() == "x,y\n1.5,\n,t\n"
