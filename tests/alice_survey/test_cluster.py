@@ -9,9 +9,11 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from distributed.client import ClosedClientError
 
 from alice_survey.core.cluster import engine
 from alice_survey.core.cluster.engine import ClusterExecutor, cluster_executor, read_cluster_file
@@ -23,7 +25,7 @@ from alice_survey.core.run.resources import Meter, cpu_s, family
 from tests import dask_tasks
 from tests.dask_machines import Machines, kill, kill_work
 from tests.small_survey import settings_in
-from tests.test_loop import FOLDERS, results, wait_for
+from tests.test_loop import results, wait_for
 
 
 @pytest.mark.parametrize("kind", ["C", "F", "every second", "one to many", "records", "read only"])
@@ -243,6 +245,17 @@ def test_a_lost_scheduler_is_a_fault_of_one_line(tmp_path: Path) -> None:
             list(found)
 
 
+def test_a_task_that_cannot_be_forgotten_hides_no_fault() -> None:
+    """A client closes some time after its scheduler was lost."""
+    future, cluster = (
+        Mock(cancel=Mock(side_effect=ClosedClientError)),
+        engine.Cluster(Mock(), Mock()),
+    )
+    engine._Submitted(Mock(cluster=cluster, send=lambda *_: future), b"", b"").cancel()
+    with pytest.raises(AliceError), cluster.report_loss():
+        future.cancel()
+
+
 @pytest.mark.slow
 def test_what_is_wrong_with_a_cluster_is_said_before_work(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -275,7 +288,7 @@ def test_what_is_wrong_with_a_cluster_is_said_before_work(
 def test_a_survey_on_a_cluster_has_the_same_bytes_whatever_is_killed(
     tiny_survey: Path, tmp_path: Path
 ) -> None:
-    """A worker is killed in every stage, and the scheduler in one of them."""
+    """A worker is killed in every stage that renders or reconstructs, in one the scheduler."""
     workspace = settings_in(tmp_path / "survey")
     events = workspace.with_suffix(".jsonl")
     with Machines(tmp_path / "machines") as machines:
@@ -284,7 +297,7 @@ def test_a_survey_on_a_cluster_has_the_same_bytes_whatever_is_killed(
             "--cluster", str(machines.file), "--log-file", str(events),
         ]  # fmt: skip
         run = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
-        for number, stage in enumerate(FOLDERS):
+        for number, stage in enumerate(("pool", "images", "mapping", "dense", "mosaic", "mesh")):
             assert wait_for(run, events, 0, event="stage_started", stage=stage), stage
             wait_for(run, events, 0, max_s=2.0, event="step_progress", stage=stage)
             kill_work(machines.workers[number % 2])

@@ -307,11 +307,13 @@ class Cluster:
         Raises:
             AliceError: it does not.
         """
+        from distributed.client import ClosedClientError
+
         try:
             yield
         except TimeoutError:
             raise
-        except (CancelledError, OSError) as error:
+        except (CancelledError, ClosedClientError, OSError) as error:
             raise AliceError(
                 f"the scheduler at {self.where} was lost ({type(error).__name__}): start it and "
                 f"its workers again; {_GOES_ON}"
@@ -376,13 +378,12 @@ class _Submitted:
     """A task that a worker does, or another when that one cannot."""
 
     def __init__(self, tasks: _Tasks, function: bytes | str, arguments: bytes) -> None:
-        self._tasks = tasks
-        self._function, self._arguments = function, arguments
+        self._tasks, self._function, self._arguments = tasks, function, arguments
         self._future = tasks.send(function, arguments)
 
     def cancel(self) -> None:
         """Forget it; a worker that is doing it goes on to its end."""
-        with contextlib.suppress(CancelledError, OSError):
+        with contextlib.suppress(AliceError, TimeoutError), self._tasks.cluster.report_loss():
             self._future.cancel()
 
     def result(self) -> Any:
