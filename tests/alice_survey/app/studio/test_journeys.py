@@ -150,7 +150,7 @@ def seen(frame: int, point: Point) -> Point:
 
 def card(folder: Path) -> list[int]:
     """A diver's pictures without any calibration; the frames that they are."""
-    frames = list(range(0, len(dive.path_m()), 2))
+    frames = list(range(0, len(dive.path_m()), 4))
     folder.mkdir()
     for frame, picture in zip(frames, dive.dive_frames(frames), strict=True):
         cv2.imwrite(str(folder / f"P{frame:04d}.png"), picture)
