@@ -1,11 +1,7 @@
 """Pictures of a board before the four cameras of `rig_survey`, in air and in water, and what the
 command line finds from them.
-
-`python -m tests.reconstruct.rig_calibration WORK` renders board and survey, calibrates, and maps
-the survey with the rig that was found, by all cameras and without the reference.
 """
 
-import sys
 from functools import lru_cache
 from pathlib import Path
 
@@ -13,22 +9,15 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.core.executor import Executor, local_executor
-from camera_calib.rig import Rig, read_rig
+from alice_survey.core.executor import Executor
+from camera_calib.rig import Rig
 from camera_calib.targets.target import parse_target
-from tests.camera_calib.calibration_scenes import errors_over_sigmas, in_air, views_of_some
+from tests.camera_calib.calibration_scenes import in_air, views_of_some
 from tests.oracles_targets import light_through, to_srgb
-from tests.reconstruct.rig_survey import (
-    command,
-    four_cameras,
-    import_survey,
-    places,
-    render_survey,
-    score,
-)
+from tests.reconstruct.rig_survey import command, four_cameras, places
 
 BOARD = parse_target("chessboard 9x6 40mm")
-VIEWS = 40
+VIEWS = 28
 _NOISE = 0.006
 """Of light, where white is 0.7."""
 HOUSINGS = (
@@ -75,19 +64,3 @@ def calibrated_rig(folder: Path, executor: Executor) -> Path:
         command("calibrate", *pictures, *known, "-o", folder / medium)
         found = folder / medium / "rig.json"
     return found
-
-
-if __name__ == "__main__":
-    work = Path(sys.argv[1])
-    path = calibrated_rig(work, local_executor())
-    over = errors_over_sigmas(read_rig(path), four_cameras())
-    sys.stdout.write("".join(f"{key} {value:+.2f}\n" for key, value in over.items()))
-    values = np.abs(list(over.values()))
-    sys.stdout.write(f"error over sigma {np.sqrt(np.mean(values**2)):.2f}, {values.max():.2f}\n")
-    survey, names = work / "pictures", list(four_cameras().cameras)
-    render_survey(survey, local_executor())
-    for chosen in (names, names[1:]):
-        made = work / "-".join(chosen)
-        import_survey(survey, path, made, chosen)
-        command("reconstruct", "-w", made)
-        sys.stdout.write(f"{', '.join(chosen)}: {score(made)}\n")

@@ -1,8 +1,4 @@
-"""A rendered survey with four unlike cameras, two of which look obliquely, and its score.
-
-`python -m tests.reconstruct.rig_survey WORK wide tele bow side` renders it, imports the pictures of
-these cameras, reconstructs by the command line and prints the score in ground pixels.
-"""
+"""A rendered survey with four unlike cameras, two of which look obliquely, and its score."""
 
 import csv
 import subprocess
@@ -19,7 +15,7 @@ from scipy.spatial.transform import RigidTransform
 from shapely.geometry import MultiPolygon, box
 
 from alice_survey.core.config import ImagingConfig, SeafloorConfig
-from alice_survey.core.executor import Executor, local_executor
+from alice_survey.core.executor import Executor
 from alice_survey.core.frames import BODY_FROM_NADIR_CAM, Datum, rotation_from_attitude
 from alice_survey.core.manifest import read_manifest
 from alice_survey.core.records import RegistrationRecord
@@ -188,31 +184,22 @@ class RigScore:
     pixel_m: float
     """Side of a pixel on the sea floor."""
 
-    def __str__(self) -> str:
-        cameras, surface, mosaic = self.cameras, self.surface.to_json(), self.mosaic.to_json()
-        doming, sigmas = surface["doming"], surface["error_over_sigma"]
-        return (
-            f"{cameras.registered} of {cameras.total} pictures, {1e3 * self.pixel_m:.2f} mm a pixel"
-            f"; cameras {1e3 * cameras.rms_m:.3f} mm rms ({cameras.rms_m / self.pixel_m:.3f} px), "
-            f"scale {1e6 * cameras.scale_error:+.0f} ppm; surface "
-            f"{surface['distance_rms_mm']:.2f} mm rms "
-            f"({1e-3 * surface['distance_rms_mm'] / self.pixel_m:.2f} px), complete to "
-            f"{surface['completeness']:.1%}, domed by {doming['dome_mm']} mm, error over sigma "
-            f"{sigmas['rms']}; mosaic {mosaic['position_rms_mm']:.2f} mm rms"
-        )
 
-
-def score(workspace: Path, lines: int = LINES) -> RigScore:
-    """Score a workspace whose pictures are of this survey."""
+def placed(workspace: Path, lines: int = LINES) -> tuple[CameraScore, float]:
+    """Errors of cameras in a workspace whose pictures are of this survey, and a ground pixel."""
     rig, poses = four_cameras(), bodies(lines)
     records = read_manifest(workspace / "images" / "manifest.csv")
     truth = {r.image: poses[r.station] * rig.body_from_cam(r.camera) for r in records}
     total = RegistrationRecord.read(workspace / "sparse" / "registration.json").total
     cameras = score_cameras(read_track_poses(workspace / "sparse" / "track.csv"), truth, total)
-    terrain = scene().terrain
-    pixel_m = ground_pixel_m(rig, {r.image: r.camera for r in records}, truth, terrain)
+    of = {r.image: r.camera for r in records}
+    return cameras, ground_pixel_m(rig, of, truth, scene().terrain)
 
-    moved = cameras.truth_from_world
+
+def score(workspace: Path, lines: int = LINES) -> RigScore:
+    """Score a workspace that is reconstructed to its mosaic."""
+    cameras, pixel_m = placed(workspace, lines)
+    terrain, moved = scene().terrain, cameras.truth_from_world
     dense = workspace / "dense"
     heights = elevation_in(dense)
     surface = score_surface(heights, area(lines), terrain, moved, pixel_m)
@@ -241,12 +228,3 @@ def import_survey(pictures: Path, rig: Path, workspace: Path, names: Sequence[st
     """Import the pictures of some cameras; what the command printed."""
     files = ("--rig", rig, "--navigation", pictures / "navigation.csv")
     return command("import-images", *places(pictures, names), *files, "-w", workspace)
-
-
-if __name__ == "__main__":
-    work, chosen = Path(sys.argv[1]), sys.argv[2:] or list(four_cameras().cameras)
-    render_survey(work / "pictures", local_executor())
-    made = work / "-".join(chosen)
-    sys.stdout.write(import_survey(work / "pictures", work / "pictures" / "rig.json", made, chosen))
-    sys.stdout.write(command("reconstruct", "-w", made))
-    sys.stdout.write(f"{score(made)}\n")
