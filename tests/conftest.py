@@ -41,7 +41,7 @@ settings.load_profile("busy")
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("alice_survey", "camera_calib", "missions", "reconstruct")
 CACHE = ROOT / ".pytest_cache" / "surveys"
-DAILY_EXAMPLES = 25
+DAILY_EXAMPLES = 15
 """Of hypothesis in `make test`; in `make test-all` as many as each test states."""
 MAX_CPU_S = 5.0
 """Processor's time of a test that is not `slow`, without its fixtures; on a machine with other work
