@@ -118,9 +118,9 @@ def _logs(folder: Path, made: Made) -> None:
     files.photos(made.reef, folder / "photos", FEW, late_s=files.FAST_S)
 
 
-def _few_features(folder: Path) -> None:
+def _few_features(folder: Path, colour: str = "even") -> None:
     """Settings for small pictures, in which nothing moves; a reader's need none."""
-    settings = "[reconstruct]\nmax_features = 600\nmask_moving = false\n"
+    settings = f"[reconstruct]\nmax_features = 600\nmask_moving = false\ncolour = '{colour}'\n"
     (folder / "survey.toml").write_text(settings)
 
 
@@ -158,7 +158,7 @@ def _own_pictures(folder: Path, made: Made) -> None:
     shutil.copy(made.small_rig, folder / "rig.json")
     given_divers.chapters(folder)
     given_divers.card(folder / "card")
-    _few_features(folder)
+    _few_features(folder, "water")
 
 
 def _robots(folder: Path, made: Made) -> None:
