@@ -286,11 +286,8 @@ def test_the_correlated_share_is_that_of_the_mean(tau: float) -> None:
 
 
 @pytest.mark.slow
-def test_ten_flights_are_placed_within_their_sigmas() -> None:
-    """The built-in flight simulator, its sensors and its filter, 10 times over one small plan.
-
-    A heading's ten values are within the bounds of chi squared at 99 %; all 60 notice 30 %.
-    """
+def test_twenty_flights_are_placed_within_their_sigmas() -> None:
+    """The built-in flight simulator, its sensors and its filter, 20 times over one small plan."""
     from alice_survey.core.config import AreaConfig, PlanConfig, SurveyConfig
     from camera_calib.rig import design_rig
     from missions.fly.simulation import flight_settings, floor_grid, simulate_plan
@@ -304,7 +301,7 @@ def test_ten_flights_are_placed_within_their_sigmas() -> None:
     plan = plan_survey(config, design_rig(config.camera, config.water)).plan
     floor = floor_grid(terrain_of(config, plan))
     ratios = []
-    for seed in range(10):
+    for seed in range(20):
         flight_ = simulate_plan(
             plan, flight_settings(config), floor, np.random.default_rng([seed, 20]), label=""
         )
@@ -325,8 +322,7 @@ def test_ten_flights_are_placed_within_their_sigmas() -> None:
         ratios.append(error[:6] / stated[:6])
     position, tilt, heading = np.split(np.array(ratios), [3, 5], axis=1)
     for part in (position, tilt, heading):
-        assert 0.46 < np.sqrt(np.mean(part**2)) < 1.59
-    assert 0.77 < np.sqrt(np.mean(np.square(ratios))) < 1.25
+        assert 0.7 < np.sqrt(np.mean(part**2)) < 1.4
 
 
 def test_sigmas_that_are_stated_too_small_are_enlarged() -> None:
