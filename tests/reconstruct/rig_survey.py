@@ -176,9 +176,8 @@ def render_survey(folder: Path, executor: Executor, lines: int = LINES) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class RigScore:
-    """Errors of a survey against its truth."""
+    """Errors of a survey's products against its truth."""
 
-    cameras: CameraScore
     surface: SurfaceScore
     mosaic: MosaicScore
     pixel_m: float
@@ -207,7 +206,7 @@ def score(workspace: Path, lines: int = LINES) -> RigScore:
         workspace / "mosaic" / "mosaic.tif", heights, area(lines), terrain,
         scene().texture, moved,
     )  # fmt: skip
-    return RigScore(cameras=cameras, surface=surface, mosaic=mosaic, pixel_m=pixel_m)
+    return RigScore(surface=surface, mosaic=mosaic, pixel_m=pixel_m)
 
 
 def command(*arguments: str | Path) -> str:
