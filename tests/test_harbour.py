@@ -168,7 +168,6 @@ def test_an_overhang_needs_both_of_its_surfaces() -> None:
     assert halved["lower"] == 1.0
 
 
-@pytest.mark.slow
 def test_points_on_a_fish_are_found_and_kept_apart(truth: Truth) -> None:
     rng = np.random.default_rng(3)
     at = time_of(5)

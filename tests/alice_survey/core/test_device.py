@@ -50,7 +50,6 @@ def test_without_the_extra_only_a_demand_for_a_gpu_is_an_error(
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.slow
 def test_a_gpu_that_does_not_answer_is_an_error_of_one_line(
     monkeypatch: pytest.MonkeyPatch, chosen: Chosen
 ) -> None:

@@ -309,7 +309,6 @@ def test_water_inside_the_nose_is_carried_where_it_is() -> None:
 @pytest.mark.parametrize(
     ("vehicle", "seconds", "at_10_ms", "at_5_ms"),
     [(m.alice(), 20, 5e-6, 1e-6), (vehicle_from("alice"), 12, 2e-5, 5e-6)],
-    ids=["open-water", "all-laws"],
 )
 def test_runge_kutta_agrees_with_an_adaptive_method(
     vehicle: Vehicle, seconds: int, at_10_ms: float, at_5_ms: float
