@@ -530,8 +530,7 @@ def atomic_path(path: Path, *, lasting: bool = True) -> Iterator[Path]:
     """A path to write to, next to `path`, that replaces it when all went well and is on the disk.
 
     Threads, processes and machines that write the same file each get a path of their own: the last
-    one that finishes is kept, whole. What need not survive a power cut, since no run would go on
-    from it, is not lasting and does not wait for the disk.
+    one that finishes is kept, whole. What is not `lasting` a power cut may leave empty or in part.
 
     Raises:
         WorkspaceError: there is a folder of that name.

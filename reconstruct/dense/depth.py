@@ -11,7 +11,8 @@ always positive: `d = f B / Z`.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -136,6 +137,17 @@ def warp(
     homography = _FROM_CORNER @ rect_from_picture @ np.linalg.inv(_FROM_CORNER)
     size = (rectification.width_px, rectification.height_px)
     return np.asarray(cv2.warpPerspective(picture, homography, size, flags=interpolation))
+
+
+def mirror(pair: Rectification) -> Rectification:
+    """The pair with its partner as the left picture: both virtual pictures seen in a mirror."""
+    turn = np.array([[-1.0, 0, pair.width_px], [0, 1, 0], [0, 0, 1]])
+    return replace(
+        pair,
+        rect_from_reference=turn @ pair.rect_from_partner,
+        rect_from_partner=turn @ pair.rect_from_reference,
+        cosines=pair.cosines[::-1].copy(),
+    )
 
 
 def depth_in_reference(
@@ -269,6 +281,8 @@ _MIN_SLOPE = 2.0
 """Mean change over two pixels, grey levels, around a pixel that can be matched."""
 _STEPS = 16
 """OpenCV counts disparity in sixteenths of a pixel."""
+_CODES = 32
+"""What `undo_rounding` makes of them are thirty-seconds."""
 _SHIFTED = 0.2
 """Share of half a picture by which no port shifts a pixel: what lies farther out is not seen."""
 GATE_SIGMAS = 3.0
@@ -350,10 +364,59 @@ class PartnerDepth:
         return self.depth * self.depth * np.float32(match_sigma_px / self.focal_baseline)
 
 
+class PairMatch(NamedTuple):
+    """What the virtual pictures of a pair show at which disparity."""
+
+    pair: Rectification
+    codes: NDArray[np.uint16]
+    """(h, w) disparity of the left one, 32 a pixel, 0 where unknown."""
+
+    def depth(self, reference: View, partner: View) -> PartnerDepth:
+        """Depth of the reference."""
+        disparity = np.where(self.codes > 0, self.codes * np.float32(1 / _CODES), np.nan)
+        depth = depth_in_reference(reference, partner, self.pair, disparity.astype(np.float32))
+        return PartnerDepth(depth=depth, focal_baseline=self.pair.focal_px * self.pair.baseline)
+
+    def swap(self) -> "PairMatch":
+        """The same of the partner: where it shows what the reference was matched with."""
+        return PairMatch(mirror(self.pair), as_partner(self.codes))
+
+
+@compiled
+def as_partner(codes: NDArray[np.uint16]) -> NDArray[np.uint16]:
+    """A map of disparity as the right virtual picture has it, both mirrored left to right.
+
+    Between neighbours in the left picture it is linear; where two surfaces fall on one pixel the
+    nearer one counts, and next to a step nothing is known.
+    """
+    height, width = codes.shape
+    found = np.zeros_like(codes)
+    for row in range(height):
+        for column in range(width - 1):
+            here, next_ = np.int64(codes[row, column]), np.int64(codes[row, column + 1])
+            if here == 0 or next_ == 0 or abs(next_ - here) >= _CODES:
+                continue
+            span = _CODES + here - next_  # by which the two lie apart in the right picture
+            start = _CODES * column - here
+            for right in range(max(-(-start // _CODES), 0), (start + span) // _CODES + 1):
+                share = (_CODES * right - start) / span
+                code = np.uint16(here + share * (next_ - here) + 0.5)
+                found[row, width - 1 - right] = max(found[row, width - 1 - right], code)
+    return found
+
+
 def pair_depth(
     views: tuple[View, View], looks: tuple[Look, Look], points_world: Array
 ) -> PartnerDepth | None:
-    """Depth of a reference view from one partner.
+    """Depth of a reference view from one partner; None where the pair cannot be rectified."""
+    found = match_pair(views, looks, points_world)
+    return None if found is None else found.depth(*views)
+
+
+def match_pair(
+    views: tuple[View, View], looks: tuple[Look, Look], points_world: Array
+) -> PairMatch | None:
+    """Match two views.
 
     Args:
         views: the reference, and the partner to match it with.
@@ -372,8 +435,8 @@ def pair_depth(
     disparity = match(left, right, pair.disparities_px)
     disparity[~_valid(usable, pair.rect_from_reference, pair)] = np.nan
     _drop_outside(disparity, _valid(usable_partner, pair.rect_from_partner, pair))
-    depth = depth_in_reference(*views, pair, without_mixed(disparity))
-    return PartnerDepth(depth=depth, focal_baseline=pair.focal_px * pair.baseline)
+    codes = np.nan_to_num(without_mixed(disparity) * np.float32(_CODES))
+    return PairMatch(pair, np.rint(codes).astype(np.uint16))
 
 
 def enlarge(depth: Float32, size_px: tuple[int, int]) -> Float32:

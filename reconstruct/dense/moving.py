@@ -20,7 +20,7 @@ from alice_survey.core.artefacts import atomic_path, write_csv
 from alice_survey.core.block_solver import MAD_TO_SIGMA
 from alice_survey.core.frames import Array
 from camera_calib.approximation.pinhole_warp import PinholeWarp
-from reconstruct.dense.view_store import ViewStore
+from reconstruct.dense.view_store import CHECKED, FACTORS, PICTURE, ViewStore, pack
 from reconstruct.dense.views import ViewTask
 from reconstruct.pictures.undistorted import MOVING, Pictures, moving_path, read_mask
 from reconstruct.raster import write_png
@@ -58,7 +58,7 @@ _ABOUT = ("moving.csv", "moving.png")
 _LOGARITHMS = np.log(np.maximum(np.arange(256, dtype=np.float32), np.float32(_DARKEST)))
 """Of grey levels."""
 _OUTLINE_BGR = (60, 60, 255)
-_LOOK = ("look.light", "look.usable", "look.depth")
+_LOOK = "look"
 
 
 class MovingShare(NamedTuple):
@@ -182,22 +182,22 @@ def keep_look(task: ViewTask) -> None:
     step = _step(view)
     h, w = height // step, width // step
     colour = store.load_colour(index)
-    factors = cv2.resize(store.load(index, "factors"), (width, height))
-    valid = store.load_mask(index, "valid", width) & (colour.max(axis=2) > _DARKEST)
+    factors = cv2.resize(store.load(0, FACTORS)[index], (width, height))
+    valid = store.load_mask(index, PICTURE, "valid", width) & (colour.max(axis=2) > _DARKEST)
     depth, _ = store.load_depth(index, "fine")
-    depth[~store.load_mask(index, "kept", width)] = np.nan
+    depth[~store.load_mask(index, CHECKED, "kept", width)] = np.nan
     part = slice(0, h * step), slice(0, w * step)
     middle = slice(step // 2, h * step, step), slice(step // 2, w * step, step)
     shown = cv2.resize(_LOGARITHMS[colour[part]], (w, h), interpolation=cv2.INTER_AREA)
     usable = cv2.resize(valid[part].astype(np.uint8), (w, h), interpolation=cv2.INTER_AREA) > 0
-    looks = with_bounds(shown + np.log(factors[middle])), usable, depth[middle]
-    for name, values in zip(_LOOK, looks, strict=True):
-        store.save(index, name, np.ascontiguousarray(values))
+    light = with_bounds(shown + np.log(factors[middle]))
+    store.save(index, _LOOK, pack(light=light, usable=usable, depth=depth[middle]))
 
 
 def load_look(store: ViewStore, index: int, view: View) -> Look:
     """What `keep_look` kept."""
-    return Look(view, _step(view), *(np.asarray(store.load(index, name)) for name in _LOOK))
+    kept = store.load(index, _LOOK)
+    return Look(view, _step(view), *(np.asarray(kept[name]) for name in kept.dtype.names or ()))
 
 
 def _step(view: View) -> int:

@@ -60,18 +60,17 @@ from reconstruct.dense.surface_tiles import (
     on_plane,
     reach_tiles,
 )
-from reconstruct.dense.view_store import ViewStore
+from reconstruct.dense.view_store import FACTORS, ViewStore
 from reconstruct.dense.views import (
     ViewTask,
     check_view,
     find_match_sigma,
     find_sigma_factor,
-    lay_out_view,
     light_parts,
-    looked_at,
+    match_view,
+    pairs_once,
     prepare_view,
     refine_view,
-    view_depth,
 )
 from reconstruct.light.solve import solve_light, write_light
 from reconstruct.mosaic.grid import mean_pixel
@@ -95,6 +94,7 @@ _RIM = FILL_CELLS + STRAY_CELLS + 3
 def fuse_planes(
     setup: FuseSetup,
     model: SparseModel,
+    summaries: Sequence[ViewSummary],
     poses: ErrorsOfPoses | None,
     folder: Path,
     cell_m: float | None,
@@ -108,6 +108,7 @@ def fuse_planes(
     Args:
         setup: confirmed depth of all views, and the planes.
         model: views at the size of their depth, in the world.
+        summaries: where the points of every view lie.
         poses: what their errors do to points.
         folder: of the stage.
         cell_m: side of a cell; None takes it from the pictures' resolution.
@@ -119,12 +120,6 @@ def fuse_planes(
     Raises:
         ReconstructionError: no depth was confirmed, or nothing is seen on any plane.
     """
-    views = [
-        ViewTask(store=setup.store, index=n, view=view, others=())
-        for n, view in enumerate(model.views)
-    ]
-    lay_out = partial(lay_out_view, setup.sigma_factor)
-    summaries = list(executor.map(lay_out, views, label="lay out"))
     bounds = [summary.bounds for summary in summaries if summary.bounds is not None]
     tiles: list[SurfaceTile] = []
     if bounds:
@@ -136,8 +131,8 @@ def fuse_planes(
         tiles = list(executor.map(fuse, tasks, label="fuse", total=len(reached)))
     if not any(tile.count for tile in tiles):
         raise ReconstructionError(
-            f"no depth was confirmed by a second view in {len(views)} pictures; they need more "
-            "overlap, sharper texture or better positions"
+            f"no depth was confirmed by a second view in {len(summaries)} pictures; they need "
+            "more overlap, sharper texture or better positions"
         )
     write_clouds(folder, setup.store, tiles, setup.offset_enu, model.frame, cell, executor)
     shutil.rmtree(folder / PLANES, ignore_errors=True)  # of a run that was interrupted
@@ -306,24 +301,22 @@ def run_dense(
 
     prepare = partial(prepare_view, workspace)
     _drain(executor.map(prepare, tasks([()] * len(views)), label="even out pictures"))
-    to_match = tasks(partners)
-    probes = [(to_match[n], points.of(n)) for n in choose_probes(partners)]
-    match_sigma_px = find_match_sigma(matching, probes, executor)
-    match = partial(view_depth, matching, match_sigma_px)
-    matched = ((task, points.of(task.index)) for task in to_match)
+    matched = ((task, points.of(task.index)) for task in tasks(pairs_once(partners)))
+    match, looks = partial(match_view, matching), tasks(partners)
     _drain(executor.map(match, matched, label="match", total=len(views)))
-    looks = [looked_at(views, n, chosen) for n, chosen in enumerate(partners)]
-    refine = partial(refine_view, matching, on_gpu=executor.uses_gpu)
-    _drain(executor.map(refine, tasks(looks), label="refine"))
+    probes = [looks[n] for n in choose_probes(partners)]
+    match_sigma_px = find_match_sigma(matching, probes, executor)
+    refine = partial(refine_view, matching, match_sigma_px, on_gpu=executor.uses_gpu)
+    _drain(executor.map(refine, looks, label="refine"))
     checks = tasks(neighbours(model, _CHECKING))
     sigma_factor = find_sigma_factor(checks, executor)
     check = partial(check_view, sigma_factor)
-    nodes, samples = zip(*executor.map(check, checks, label="cross-check"), strict=True)
+    checked = executor.map(check, checks, label="cross-check")
+    nodes, samples, summaries = zip(*checked, strict=True)
     images, cameras = [view.image for view in views], [view.camera for view in views]
     light = solve_light(light_parts(store, samples, executor), np.stack(nodes), images, cameras)
     write_light(folder / "light.json", light)
-    for n, view in enumerate(views):
-        store.save(n, "factors", light.factors(view.camera, view.image))
+    store.save(0, FACTORS, np.stack([light.factors(view.camera, view.image) for view in views]))
     moving = []
     clear_moving(folder)
     if reconstruct.mask_moving:
@@ -333,7 +326,7 @@ def run_dense(
         moving = list(executor.map(mask, others, label="mask what moves"))
         show_moving(workspace, folder, moving)
     stations = np.array([view.station for view in views], dtype=np.int64)
-    apart = [[m for m in chosen if stations[m] != stations[n]] for n, chosen in enumerate(looks)]
+    apart = [[m for m in chosen if stations[m] != stations[n]] for n, chosen in enumerate(partners)]
     setup = FuseSetup(
         store=store,
         stations=stations,
@@ -343,7 +336,7 @@ def run_dense(
     )
     poses = find_errors_of_poses(workspace, model)
     placed = replace(model, views=tuple(views))
-    made = fuse_planes(setup, placed, poses, folder, reconstruct.dem_cell_m, executor)
+    made = fuse_planes(setup, placed, summaries, poses, folder, reconstruct.dem_cell_m, executor)
     (plane, grid), *_ = made
     pose_sigma = None if poses is None else poses.median_along(plane.normal_world)
     SurfaceRecord.save(

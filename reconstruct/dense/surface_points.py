@@ -316,7 +316,7 @@ def _fuse_along(
     starts = np.flatnonzero(np.concatenate([[True], np.any(np.diff(at), axis=0), [True]]))
     cells = np.stack(at, axis=1)[starts[:-1]]
     found = fuse_cells(
-        starts, origin[across] + (cells + 0.5) * cell, points.part(order), stations, cell,
+        starts, origin[across] + (cells + 0.5) * cell, points, order, stations, cell,
         (across[0], across[1], axis), sign, _GATE, shared,
     )  # fmt: skip
     records = np.zeros(len(found[0]), SURFACE_POINT)
@@ -330,6 +330,7 @@ def fuse_cells(
     starts: NDArray[np.int64],
     middles: Array,
     points: Points,
+    order: NDArray[np.int64],
     stations: NDArray[np.int64],
     cell: float,
     axes: tuple[int, int, int],
@@ -344,7 +345,8 @@ def fuse_cells(
     Args:
         starts: (C + 1,) where the points of each cell start.
         middles: (C, 2) of the cells.
-        points: sorted by cell, then by view.
+        points: in ascending order of their views.
+        order: numbers of points by cell, then by view.
         stations: (V,) of every view, by its number.
         cell: side of a cell.
         axes: the two axes of the cells, and that of the direction.
@@ -356,7 +358,7 @@ def fuse_cells(
         Columns of `SURFACE_POINT` without what points share.
     """
     enu, normals, colours, sigmas, views = points
-    maximum, count = enu.shape[0], 0
+    maximum, count = order.size, 0
     place, normal = np.empty((maximum, 3), np.float32), np.empty((maximum, 3), np.float32)
     colour = np.empty((maximum, 3), np.uint8)
     sigma = np.empty(maximum, np.float32)
@@ -364,20 +366,21 @@ def fuse_cells(
     a, b, along = axes
     middle, mean, tint = np.empty(3), np.empty(3), np.empty(3)
     for n in range(starts.size - 1):
-        first, last = starts[n], starts[n + 1]
-        size = last - first
+        own = order[starts[n] : starts[n + 1]]
+        size = own.size
         middle[a], middle[b] = middles[n, 0], middles[n, 1]
         heights = np.empty(size, np.float32)
         spreads = np.empty(size, np.float32)
         steep = np.empty(size, np.float32)
         for i in range(size):
-            up = sign * normals[first + i, along]
-            lift = (enu[first + i, a] - middle[a]) * normals[first + i, a]
-            lift += (enu[first + i, b] - middle[b]) * normals[first + i, b]
-            heights[i] = sign * enu[first + i, along] + lift / up
-            spreads[i] = sigmas[first + i] / up
+            j = own[i]
+            up = sign * normals[j, along]
+            lift = (enu[j, a] - middle[a]) * normals[j, a]
+            lift += (enu[j, b] - middle[b]) * normals[j, b]
+            heights[i] = sign * enu[j, along] + lift / up
+            spreads[i] = sigmas[j] / up
             steep[i] = math.sqrt(max(1.0 - up * up, 0.0)) / up
-        numbers = views[first:last]
+        numbers = views[own]
         layers, layer = surfaces_of(heights, spreads, stations[numbers], steep, cell)
         for one in range(layers):
             mean[:] = 0.0
@@ -385,20 +388,22 @@ def fuse_cells(
             weights = 0.0
             for i in range(size):
                 if layer[i] == one:
-                    w = 1.0 / sigmas[first + i] ** 2
+                    j = own[i]
+                    w = 1.0 / sigmas[j] ** 2
                     weights += w
                     for k in range(3):
-                        mean[k] += w * normals[first + i, k]
-                        tint[k] += w * colours[first + i, k]
+                        mean[k] += w * normals[j, k]
+                        tint[k] += w * colours[j, k]
             length = math.sqrt(mean[0] ** 2 + mean[1] ** 2 + mean[2] ** 2)
             mean /= max(length, 1e-30)
             up = sign * mean[along]
             if up < abs(mean[a]) or up < abs(mean[b]):
                 continue
             for i in range(size):
-                lift = (enu[first + i, a] - middle[a]) * mean[a]
-                lift += (enu[first + i, b] - middle[b]) * mean[b]
-                heights[i] = sign * enu[first + i, along] + lift / up
+                j = own[i]
+                lift = (enu[j, a] - middle[a]) * mean[a]
+                lift += (enu[j, b] - middle[b]) * mean[b]
+                heights[i] = sign * enu[j, along] + lift / up
             members = layer == one
             height, deviation, in_views, at_stations = robust_height(
                 heights[members], spreads[members], numbers[members], stations, gate, shared

@@ -11,6 +11,7 @@ together, minus what its own observations leave with poses held. The rest is wha
 it do to a surface there.
 """
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -22,12 +23,13 @@ from numpy.typing import NDArray
 from rasterio.windows import Window
 from scipy.spatial import cKDTree
 
+from alice_survey.core.compiled import compiled
 from alice_survey.core.errors import warn
 from alice_survey.core.frames import Array
 from alice_survey.core.run import progress
 from reconstruct.dense.points import EDGE_ON, Points, join_points, part_in_box, points_in_box
 from reconstruct.dense.surface_points import PART_REACH_CELLS, SURFACE_POINT, fuse_surface, settle
-from reconstruct.dense.view_store import StoredDepth, ViewStore
+from reconstruct.dense.view_store import CHECKED, FACTORS, StoredDepth, ViewStore
 from reconstruct.planes import Plane
 from reconstruct.raster import DemGrid, tiles_reached
 from reconstruct.views.model import SparseModel, View
@@ -126,7 +128,7 @@ _GATE = 3.0
 """Depths that differ by no more than this many standard deviations of their difference agree."""
 _MIN_KNOWN = 5
 """Of the nine pixels around a spot, for a view to see through it."""
-_AROUND = np.mgrid[-1:2, -1:2].reshape(2, 9)
+_HERE, _THROUGH = 1, 2
 
 
 def look_at_points(
@@ -148,18 +150,38 @@ def look_at_points(
     Returns:
         (N,) whether the view finds the point, and (N,) whether it sees through it.
     """
+    z = view.world_from_cam.inv().apply(points_world)[:, 2].copy()
+    pixels = np.nan_to_num(view.project(points_world), nan=-1.0)
+    codes = look_around(z, pixels, np.array(sigmas), depth, factor, cell)
+    return codes == _HERE, codes == _THROUGH
+
+
+@compiled(error_model="numpy")
+def look_around(
+    z: Array, pixels: Array, sigmas: Float32, depth: StoredDepth, factor: float, cell: float
+) -> NDArray[np.int8]:
+    """See `look_at_points`, of points (N,) at depths and pixels (N, 2) of a view."""
     levels, shares, depth_of, share_of = depth
-    z = view.world_from_cam.inv().apply(points_world)[:, 2:]
-    at = np.floor(np.nan_to_num(view.project(points_world), nan=-1.0)).astype(np.int64)
-    inside = np.asarray(((at >= 1) & (at < np.array(levels.shape[::-1]) - 1)).all(axis=1))
-    place = np.where(inside[:, None], at, 1)[:, ::-1, None] + _AROUND
-    level, share = (codes[place[:, 0], place[:, 1]] for codes in (levels, shares))
-    there = depth_of[level]  # NaN where unknown
-    tolerance = cell + _GATE * np.hypot(sigmas[:, None], factor * there * share_of[share])
-    here = inside & (np.abs(there - z) <= tolerance).any(axis=1)
-    known, beyond = np.isfinite(there), there > z
-    through = (known.sum(axis=1) >= _MIN_KNOWN) & (beyond == known).all(axis=1)
-    return here, inside & through & ~here
+    found = np.zeros(z.size, np.int8)
+    for i in range(z.size):
+        column, row = math.floor(pixels[i, 0]), math.floor(pixels[i, 1])
+        if not (1 <= column < levels.shape[1] - 1 and 1 <= row < levels.shape[0] - 1):
+            continue
+        known, beyond = 0, 0
+        for k in range(9):
+            at = row - 1 + k // 3, column - 1 + k % 3
+            if levels[at] == 0:
+                continue
+            there = depth_of[levels[at]]
+            reach = cell + _GATE * math.hypot(sigmas[i], factor * there * share_of[shares[at]])
+            known += 1
+            beyond += there > z[i]
+            if abs(there - z[i]) <= reach:
+                found[i] = _HERE
+                break
+        if found[i] == 0 and known >= _MIN_KNOWN and beyond == known:
+            found[i] = _THROUGH
+    return found
 
 
 _TILE_CELLS = 256
@@ -332,9 +354,9 @@ def _points_over(
     """The confirmed points of all views in a box (west and south, east and north)."""
     store, (low, high) = setup.store, box
     sides = (low[0], high[0], low[1], high[1])
-    found = []
+    found, factors = [], store.load(0, FACTORS)
     for index, view in task.views:
-        blocks = np.asarray(store.load(index, "blocks"))
+        blocks = np.asarray(store.load(index, CHECKED)["blocks"])
         part = part_in_box(view, offset, sides, blocks)
         if part is None:
             continue
@@ -342,8 +364,8 @@ def _points_over(
         sigma *= np.float32(setup.sigma_factor)
         with np.errstate(invalid="ignore"):
             sure = sigma <= _WORST_CELLS * task.grid.cell
-        kept = store.load_mask(index, "inside", view.pinhole.width_px, part) & sure
-        colour, factors = store.load_colour(index, part), np.array(store.load(index, "factors"))
-        maps = depth, sigma, kept, colour, factors
+        kept = store.load_mask(index, CHECKED, "inside", view.pinhole.width_px, part) & sure
+        colour = store.load_colour(index, part)
+        maps = depth, sigma, kept, colour, np.array(factors[index])
         found.append(points_in_box(view, index, *maps, offset, sides, blocks, part))
     return join_points(found)

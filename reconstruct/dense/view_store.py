@@ -4,7 +4,9 @@ What is kept is kept small: depth as a 16-bit logarithm, its deviation as an 8-b
 half the resolution of brightness. A picture takes 5 bytes a pixel until its tile is fused.
 """
 
+import io
 import uuid
+import zlib
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -26,6 +28,9 @@ _MAX_RATIO = 16.0
 _SIGMA_STEP = 0.05
 _SIGMA_LEAST = 1e-6
 """Relative to the depth; 254 steps of 5 % reach a third of the depth."""
+PICTURE, CHECKED, FACTORS = "picture", "checked", "factors"
+"""Names in the store: of a picture as it is shown, of what is kept of its depth, and, of all views
+in one array, of what takes their light away."""
 
 
 StoredDepth = tuple[NDArray[np.uint16], NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]]
@@ -33,9 +38,27 @@ StoredDepth = tuple[NDArray[np.uint16], NDArray[np.uint8], NDArray[np.float32], 
 NaN for 0. Kernels that look at few pixels take it as it is."""
 
 
+def pack(**arrays: Any) -> NDArray[Any]:
+    """Arrays and numbers as one record, whose fields have their names."""
+    values = {name: np.asarray(array) for name, array in arrays.items()}
+    fields = [(name, value.dtype, value.shape) for name, value in values.items()]
+    packed = np.zeros((), np.dtype(fields, align=True))
+    for name, value in values.items():
+        packed[name] = value
+    return packed
+
+
+def pack_mask(mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """A mask (H, W), one bit a pixel."""
+    return np.packbits(mask, axis=1)
+
+
 @dataclass(frozen=True)
 class ViewStore:
-    """A folder with one file per view and name; a file is there whole or not at all."""
+    """A folder with one file per view and name; a file is there whole or not at all.
+
+    Files are not synced to the disk: those that a power cut leaves in part their sum tells.
+    """
 
     folder: Path
     run: str = field(default_factory=lambda: uuid.uuid4().hex)
@@ -47,36 +70,36 @@ class ViewStore:
 
     def has(self, view: int, name: str) -> bool:
         """Whether an array was saved."""
-        return self.path(view, name).is_file()
+        path = self.path(view, name)
+        content = path.read_bytes() if path.is_file() else b""
+        return bool(content) and content[-4:] == _sum(memoryview(content)[:-4])
 
     def save(self, view: int, name: str, array: NDArray[Any]) -> None:
-        """Keep an array."""
-        with atomic_path(self.path(view, name)) as path:
-            np.save(path, array)
+        """Keep an array, or what `pack` gives."""
+        content = io.BytesIO()
+        np.save(content, array)
+        content.write(_sum(content.getbuffer()))
+        with atomic_path(self.path(view, name), lasting=False) as path:
+            path.write_bytes(content.getbuffer())
 
     def load(self, view: int, name: str) -> NDArray[Any]:
         """The array saved before, read only where touched."""
         array: NDArray[Any] = np.load(self.path(view, name), mmap_mode="r")
         return array
 
-    def drop(self, view: int, name: str) -> None:
-        """Forget an array."""
-        self.path(view, name).unlink(missing_ok=True)
-
     def save_depth(
-        self, view: int, name: str, depth: NDArray[np.float32], sigma: NDArray[np.float32]
-    ) -> None:
+        self, view: int, name: str, depth: NDArray[np.float32], sigma: NDArray[np.float32],
+        **more: NDArray[Any],
+    ) -> None:  # fmt: skip
         """Keep depth (H, W) and its standard deviation, rounded; NaN where unknown."""
         level, share, ends = _codes(depth, sigma)
-        self.save(view, f"{name}.scale", ends)
-        self.save(view, f"{name}.sigma", share)
-        self.save(view, name, level)
+        self.save(view, name, pack(level=level, share=share, ends=ends, **more))
 
     def stored_depth(self, view: int, name: str, part: Part = WHOLE) -> StoredDepth:
         """Depth (H, W) and its standard deviation as they are stored, read only where touched."""
-        minimum, step = self.load(view, f"{name}.scale").tolist()
-        level, share = self.load(view, name)[part], self.load(view, f"{name}.sigma")[part]
-        return np.asarray(level), np.asarray(share), _depths(minimum, step), _shares()
+        kept = self.load(view, name)
+        level, share = np.asarray(kept["level"][part]), np.asarray(kept["share"][part])
+        return level, share, _depths(*kept["ends"].tolist()), _shares()
 
     def load_depth(
         self, view: int, name: str, part: Part = WHOLE
@@ -84,18 +107,18 @@ class ViewStore:
         """Depth (H, W) and its standard deviation, NaN where unknown."""
         return decode_depth(self.stored_depth(view, name, part))
 
-    def save_colour(self, view: int, colour: NDArray[np.uint8]) -> None:
+    def save_colour(self, view: int, colour: NDArray[np.uint8], **more: NDArray[Any]) -> None:
         """Keep a picture (H, W, 3) BGR: brightness in full, colour at half the resolution."""
         height, width = colour.shape[:2]
         even = cv2.copyMakeBorder(colour, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
         ycc = cv2.cvtColor(even, cv2.COLOR_BGR2YCrCb)
         half = (ycc.shape[1] // 2, ycc.shape[0] // 2)
-        self.save(view, "tint", cv2.resize(ycc[..., 1:], half, interpolation=cv2.INTER_AREA))
-        self.save(view, "bright", np.ascontiguousarray(ycc[:height, :width, 0]))
+        tint = cv2.resize(ycc[..., 1:], half, interpolation=cv2.INTER_AREA)
+        self.save(view, PICTURE, pack(bright=ycc[:height, :width, 0], tint=tint, **more))
 
     def load_bright(self, view: int, part: Part = WHOLE) -> NDArray[np.uint8]:
         """Brightness (H, W) of a picture."""
-        return np.asarray(self.load(view, "bright")[part])
+        return np.asarray(self.load(view, PICTURE)["bright"][part])
 
     def load_colour(self, view: int, part: Part = WHOLE) -> NDArray[np.uint8]:
         """A picture (H, W, 3) BGR.
@@ -106,18 +129,16 @@ class ViewStore:
         bright = self.load_bright(view, part)
         first = tuple((side.start or 0) // 2 for side in part)
         half = tuple(slice(a, a + (n + 1) // 2) for a, n in zip(first, bright.shape, strict=True))
-        tint = cv2.resize(self.load(view, "tint")[half], None, fx=2.0, fy=2.0)
+        tint = cv2.resize(self.load(view, PICTURE)["tint"][half], None, fx=2.0, fy=2.0)
         tint = tint[: bright.shape[0], : bright.shape[1]]
         return np.asarray(cv2.cvtColor(np.dstack([bright, tint]), cv2.COLOR_YCrCb2BGR))
 
-    def save_mask(self, view: int, name: str, mask: NDArray[np.bool_]) -> None:
-        """Keep a mask (H, W), one bit a pixel."""
-        self.save(view, name, np.packbits(mask, axis=1))
-
-    def load_mask(self, view: int, name: str, width: int, part: Part = WHOLE) -> NDArray[np.bool_]:
-        """A mask (H, W) of a picture of some width."""
+    def load_mask(
+        self, view: int, name: str, field: str, width: int, part: Part = WHOLE
+    ) -> NDArray[np.bool_]:
+        """A mask (H, W) of a picture of some width, that `pack_mask` made a field."""
         rows, columns = part
-        bits = np.unpackbits(self.load(view, name)[rows], axis=1, count=width)
+        bits = np.unpackbits(self.load(view, name)[field][rows], axis=1, count=width)
         return bits[:, columns].astype(np.bool_)
 
 
@@ -126,6 +147,10 @@ def decode_depth(depth: StoredDepth) -> tuple[NDArray[np.float32], NDArray[np.fl
     level, share, depths, shares = depth
     found = depths[level]
     return found, found * shares[share]
+
+
+def _sum(content: memoryview) -> bytes:
+    return zlib.crc32(content).to_bytes(4, "little")
 
 
 def _codes(

@@ -6,7 +6,7 @@ and leaves its own there.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import lru_cache, partial
 from itertools import pairwise
 from pathlib import Path
@@ -22,18 +22,20 @@ from alice_survey.core.frames import Array
 from reconstruct.dense.depth import (
     GATE_SIGMAS,
     Look,
+    PairMatch,
     PartnerDepth,
+    Rectification,
     count_confirming,
     enlarge,
+    match_pair,
     merge_depths,
-    pair_depth,
 )
 from reconstruct.dense.matching_trial import match_sigma, resize, spread
 from reconstruct.dense.points import block_bounds, points_of_pixels
 from reconstruct.dense.refine_depth import ComparedView, prepare, refine
 from reconstruct.dense.stereo_pairs import in_frame
 from reconstruct.dense.surface_tiles import ViewSummary
-from reconstruct.dense.view_store import ViewStore
+from reconstruct.dense.view_store import CHECKED, PICTURE, ViewStore, pack, pack_mask
 from reconstruct.light.solve import (
     LightSamples,
     Parts,
@@ -57,8 +59,7 @@ _PART = 400_000
 """Samples of light that are worked on at a time, some: they take 0.3 kB each."""
 _LIGHT_LATTICE = 28
 """Pixels along a picture's width at which the light of views is compared."""
-LOOKS = 4
-"""Neighbours at other stations by which depth is refined: their baselines determine it best."""
+_PAIRS = "pairs"
 _ENOUGH_APART = 2
 """From so many on the pictures of its own station only serve where none of them sees."""
 _COMPARED_VIEWS = 12
@@ -66,6 +67,9 @@ _COMPARED_STEP_PX = 7
 """Views, and pixels between the pixels of each, by which the sigma factor is measured."""
 _MIN_PIXELS = 100
 """A view with fewer pixels of confirmed depth is left out."""
+
+
+_FIELDS = [field.name for field in fields(Rectification)]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -81,14 +85,13 @@ class ViewTask:
 def prepare_view(workspace: Path, task: ViewTask) -> None:
     """Keep a picture's colour and validity at the size of depth."""
     store, view = task.store, task.view
-    if store.has(task.index, "low"):
+    if store.has(task.index, PICTURE):
         return
     size_px = view.pinhole.size_px
     pictures = Pictures.open(workspace)
     colour, valid = resize(pictures.colour(view.image), pictures.valid(view.image), size_px)
-    store.save_colour(task.index, colour)
-    store.save_mask(task.index, "valid", valid)
-    store.save(task.index, "low", low_pass(colour, valid))
+    low = low_pass(colour, valid)
+    store.save_colour(task.index, colour, valid=pack_mask(valid), low=low)
 
 
 Size = tuple[int, int]
@@ -97,7 +100,7 @@ Size = tuple[int, int]
 
 def _brightness(store: ViewStore, index: int, kept_px: Size, size_px: Size) -> Look:
     """Brightness of a picture and which of its pixels may be used, at a size."""
-    valid = store.load_mask(index, "valid", kept_px[0])
+    valid = store.load_mask(index, PICTURE, "valid", kept_px[0])
     return resize(store.load_bright(index), valid, size_px)
 
 
@@ -114,9 +117,7 @@ def _look(store: ViewStore, index: int, kept_px: Size, size_px: Size) -> tuple[N
     return prepare(*_brightness(store, index, kept_px, size_px))
 
 
-def find_match_sigma(
-    scale: float, probes: Sequence[tuple[ViewTask, Array]], executor: Executor
-) -> float:
+def find_match_sigma(scale: float, probes: Sequence[ViewTask], executor: Executor) -> float:
     """Standard deviation of a match in pixels as matched.
 
     How far depths from different partners differ, in units of what a match of `MATCH_SIGMA_PX`
@@ -124,55 +125,82 @@ def find_match_sigma(
 
     Args:
         scale: of matching, a factor on the size of the views.
-        probes: some views with their partners, and points (N, 3) that bound their depth.
+        probes: some views with their partners, all matched.
         executor: where tasks run.
     """
     match = partial(_match_apart, scale)
     return match_sigma(list(executor.map(match, probes, label="compare partners")))
 
 
-def _match_apart(scale: float, matched: tuple[ViewTask, Array]) -> float:
+def _match_apart(scale: float, task: ViewTask) -> float:
     """The `spread` of what a view's partners find."""
-    return spread(_pair_depths(scale, *matched))
+    return spread(_pair_depths(scale, task))
 
 
-def _pair_depths(scale: float, task: ViewTask, points_world: Array) -> list[PartnerDepth]:
-    """Depth of a view, shrunk by a factor, from each partner with which it can be rectified."""
-    smalls, looks = [], []
+def match_view(scale: float, matched: tuple[ViewTask, Array]) -> None:
+    """Match a view with partners, for both views of each pair.
+
+    Args:
+        scale: of matching, a factor on the size of the views.
+        matched: the view with those of its partners to match it with here (see `pairs_once`), and
+            points (N, 3) that bound its depth.
+    """
+    (task, points_world), smalls, looks = matched, [], []
+    if task.store.has(task.index, _PAIRS):
+        return
     for number, view in ((task.index, task.view), *task.others):
         smalls.append(scaled_view(view, scale))
         size_px = smalls[-1].pinhole.size_px
         looks.append(_even_picture(task.store, number, view.pinhole.size_px, size_px))
-    found = [
-        pair_depth((smalls[0], small), (looks[0], look), points_world)
-        for small, look in zip(smalls[1:], looks[1:], strict=True)
+    pairs = {"view": np.int64(task.index)}
+    for (number, _), small, look in zip(task.others, smalls[1:], looks[1:], strict=True):
+        found = match_pair((smalls[0], small), (looks[0], look), points_world)
+        if found is not None:
+            pairs[str(number)] = pack(codes=found.codes, **vars(found.pair))
+    task.store.save(task.index, _PAIRS, pack(**pairs))
+
+
+def pairs_once(partners: Sequence[Sequence[int]]) -> list[list[int]]:
+    """Those of every view's partners that it is matched with: each pair is in one of two lists."""
+    return [
+        [m for m in chosen if n < m or n not in partners[m]] for n, chosen in enumerate(partners)
     ]
-    return [depth for depth in found if depth is not None]
 
 
-def view_depth(scale: float, match_sigma_px: float, matched: tuple[ViewTask, Array]) -> None:
-    """Match a view with its partners and merge what they find.
+def _pair_depths(scale: float, task: ViewTask) -> list[PartnerDepth]:
+    """Depth of a view, shrunk by a factor, from each partner with which it could be rectified."""
+    depths, one = [], scaled_view(task.view, scale)
+    for number, view in task.others:
+        found = _pair(task.store, task.index, number)
+        swapped = None if found else _pair(task.store, number, task.index)
+        found = swapped.swap() if swapped else found
+        if found:
+            depths.append(found.depth(one, scaled_view(view, scale)))
+    return depths
 
-    Args:
-        scale: of matching, a factor on the size of the views: the depth has this size.
-        match_sigma_px: standard deviation of a match, in pixels as matched.
-        matched: the view with its partners, and points (N, 3) that bound its depth.
-    """
-    task, points_world = matched
-    store = task.store
-    if store.has(task.index, "agreeing") or store.has(task.index, "fine"):
-        return
-    depths = _pair_depths(scale, task, points_world)
+
+def _pair(store: ViewStore, view: int, partner: int) -> PairMatch | None:
+    """What `match_view` found of a view and a partner of its list."""
+    pairs = store.load(view, _PAIRS)
+    if str(partner) not in (pairs.dtype.names or ()):
+        return None
+    kept = {name: np.array(pairs[str(partner)][name]) for name in _FIELDS}
+    pair = {name: value if value.shape else value.item() for name, value in kept.items()}
+    return PairMatch(Rectification(**pair), np.asarray(pairs[str(partner)]["codes"]))
+
+
+def _merged(
+    scale: float, match_sigma_px: float, task: ViewTask
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
+    """Depth of a view on which its partners agree, its deviation, and how many do."""
+    depths = _pair_depths(scale, task)
     if depths:
         found = np.stack([one.depth for one in depths])
         sigmas = np.stack([one.sigma(match_sigma_px) for one in depths])
-        depth, sigma, agreeing = merge_depths(found, sigmas, GATE_SIGMAS)
-    else:
-        shape = scaled_view(task.view, scale).pinhole.size_px[::-1]
-        depth = np.full(shape, np.nan, np.float32)
-        sigma, agreeing = depth, np.zeros(shape, np.uint8)
-    store.save_depth(task.index, "depth", depth, sigma)
-    store.save(task.index, "agreeing", agreeing)
+        return merge_depths(found, sigmas, GATE_SIGMAS)
+    shape = scaled_view(task.view, scale).pinhole.size_px[::-1]
+    unknown = np.full(shape, np.nan, np.float32)
+    return unknown, unknown, np.zeros(shape, np.uint8)
 
 
 def _compared_view(store: ViewStore, scale: float, number: int, view: View) -> ComparedView:
@@ -192,14 +220,17 @@ def refining_scales(scale: float) -> list[float]:
     return [0.5**n for n in reversed(range(octaves))]
 
 
-def refine_view(scale: float, task: ViewTask, *, on_gpu: bool = False) -> None:
-    """Make a view's depth exact by its best neighbours at once.
+def refine_view(
+    scale: float, match_sigma_px: float, task: ViewTask, *, on_gpu: bool = False
+) -> None:
+    """Merge what a view's partners find, and make it exact by all of them at once.
 
     Pictures of its own station serve where no other station sees, or where there is hardly one.
 
     Args:
         scale: at which the depth was matched.
-        task: the view, and the neighbours to refine with.
+        match_sigma_px: standard deviation of a match, in pixels as matched.
+        task: the view and its partners.
         on_gpu: whether a GPU does it.
     """
     store, full_px = task.store, task.view.pinhole.size_px
@@ -208,7 +239,7 @@ def refine_view(scale: float, task: ViewTask, *, on_gpu: bool = False) -> None:
     apart = [other for other in task.others if other[1].station != task.view.station]
     rig = [other for other in task.others if other[1].station == task.view.station]
     first, spare = (apart, rig) if len(apart) >= _ENOUGH_APART else (task.others, [])
-    depth, sigma = store.load_depth(task.index, "depth")
+    depth, sigma, agreeing = _merged(scale, match_sigma_px, task)
     if on_gpu:
         from reconstruct.dense.refine_gpu import refine_on_gpu as refined_by
     else:
@@ -222,14 +253,9 @@ def refine_view(scale: float, task: ViewTask, *, on_gpu: bool = False) -> None:
         ]
         refined = refined_by(reference, depth, sigma, *compared)
         depth, sigma = refined.depth, refined.sigma
-    agreeing = np.asarray(store.load(task.index, "agreeing"))
     agreeing = cv2.resize(agreeing, full_px, interpolation=cv2.INTER_NEAREST)
     support = np.where(np.isfinite(start), np.maximum(agreeing, refined.seen), refined.seen)
-    store.save(task.index, "seen", support.astype(np.uint8))
-    store.save_depth(task.index, "fine", depth, sigma)
-    store.drop(task.index, "agreeing")
-    store.drop(task.index, "depth")
-    store.drop(task.index, "depth.sigma")
+    store.save_depth(task.index, "fine", depth, sigma, seen=support.astype(np.uint8))
 
 
 def find_sigma_factor(checks: Sequence[ViewTask], executor: Executor) -> float:
@@ -267,13 +293,7 @@ def disagreement(task: ViewTask) -> float:
     return MAD_TO_SIGMA * float(np.median(np.abs(apart))) if len(apart) >= _MIN_PIXELS else np.nan
 
 
-def looked_at(views: Sequence[View], index: int, partners: Sequence[int]) -> list[int]:
-    """Views to refine depth with: the best partners at other stations, and those of its own."""
-    apart = [n for n in partners if views[n].station != views[index].station]
-    return [n for n in partners if n not in apart[LOOKS:]]
-
-
-def check_view(sigma_factor: float, task: ViewTask) -> tuple[Array, int]:
+def check_view(sigma_factor: float, task: ViewTask) -> tuple[Array, int, ViewSummary]:
     """Keep the depths that two independent looks support.
 
     A depth stays where the neighbours whose windows look alike (or the partners that agree) and the
@@ -285,13 +305,13 @@ def check_view(sigma_factor: float, task: ViewTask) -> tuple[Array, int]:
         task: the view and its neighbours.
 
     Returns:
-        What the view shows at the nodes of the light model (see `light.at_nodes`), and how many
-        spots it and its neighbours show, which are left in the store.
+        What the view shows at the nodes of the light model (see `light.at_nodes`), how many
+        spots it and its neighbours show, which are left in the store, and where its points lie.
     """
     store, view = task.store, task.view
     depth, sigma = store.load_depth(task.index, "fine")
     sigma *= np.float32(sigma_factor)
-    alike = np.asarray(store.load(task.index, "seen")).astype(np.int16)
+    alike = store.load(task.index, "fine")["seen"].astype(np.int16)
     refuted = np.zeros_like(alike)
     supported = np.zeros_like(alike)
     slopes = slopes_of(depth, view.kernel_lens, 0, 0)
@@ -305,11 +325,10 @@ def check_view(sigma_factor: float, task: ViewTask) -> tuple[Array, int]:
         refuted += through
     kept = np.isfinite(depth) & (alike + supported >= 2) & (refuted <= supported)
     kept &= np.count_nonzero(kept) >= _MIN_PIXELS
-    store.save_mask(task.index, "kept", kept)
-    nodes = at_nodes(np.asarray(store.load(task.index, "low")))
+    nodes = at_nodes(np.asarray(store.load(task.index, PICTURE)["low"]))
     light = as_rows(_shared_light(task, depth, kept))
     store.save(task.index, LIGHT, light)
-    return nodes, len(light)
+    return nodes, len(light), _lay_out(task, depth, sigma, kept)
 
 
 def light_parts(
@@ -334,30 +353,25 @@ def _load_light(store: ViewStore, views: range) -> LightSamples:
     return joined_samples([from_rows(store.load(view, LIGHT)) for view in views])
 
 
-def lay_out_view(sigma_factor: float, task: ViewTask) -> ViewSummary:
-    """Find where the kept points of a view lie, without the few that lie far off.
-
-    Args:
-        sigma_factor: on the standard deviations of refined depths.
-        task: the view.
-    """
-    store, view = task.store, task.view
-    depth, sigma = store.load_depth(task.index, "fine")
-    sigma *= np.float32(sigma_factor)
-    kept = store.load_mask(task.index, "kept", view.pinhole.width_px)
-    if not kept.any():
-        return ViewSummary(bounds=None, up=np.nan, footprint=np.nan, sigma=np.nan)
+def _lay_out(
+    task: ViewTask, depth: NDArray[np.float32], sigma: NDArray[np.float32], kept: NDArray[np.bool_]
+) -> ViewSummary:
+    """Keep which points of a view are kept, and where they lie without the few that lie far off."""
+    view, inside = task.view, kept.copy()
     points = points_of_pixels(view, depth, kept)
-    store.save(task.index, "blocks", block_bounds(kept, points))
     ends = [_BOUND_PERCENT, 100 - _BOUND_PERCENT]
-    low, high = np.transpose([np.percentile(points[:, k].copy(), ends) for k in range(2)])
-    kept[kept] = ((points[:, :2] >= low) & (points[:, :2] <= high)).all(axis=1)
-    store.save_mask(task.index, "inside", kept)
+    if len(points):
+        low, high = np.transpose([np.percentile(points[:, k].copy(), ends) for k in range(2)])
+        inside[kept] = ((points[:, :2] >= low) & (points[:, :2] <= high)).all(axis=1)
+    blocks, masks = block_bounds(kept, points), (pack_mask(kept), pack_mask(inside))
+    task.store.save(task.index, CHECKED, pack(kept=masks[0], inside=masks[1], blocks=blocks))
+    if not len(points):
+        return ViewSummary(bounds=None, up=np.nan, footprint=np.nan, sigma=np.nan)
     return ViewSummary(
         bounds=(float(low[0]), float(low[1]), float(high[0]), float(high[1])),
         up=float(-np.median(points[:, 2])),
-        footprint=float(np.median(depth[kept]) / view.pinhole.focal_px),
-        sigma=float(np.median(sigma[kept])),
+        footprint=float(np.median(depth[inside]) / view.pinhole.focal_px),
+        sigma=float(np.median(sigma[inside])),
     )
 
 
@@ -370,12 +384,12 @@ def _shared_light(
     chosen[::step, ::step] = kept[::step, ::step]
     ground = points_of_pixels(task.view, depth, chosen)
     here = (np.argwhere(chosen)[:, ::-1] + 0.5) / task.view.pinhole.size_px
-    own = np.asarray(task.store.load(task.index, "low"))
+    own = np.asarray(task.store.load(task.index, PICTURE)["low"])
     parts = []
     for number, other in task.others:
         seen = in_frame(other, ground)
         there = other.project(ground[seen]) / other.pinhole.size_px
-        pictures = own, np.asarray(task.store.load(number, "low"))
+        pictures = own, np.asarray(task.store.load(number, PICTURE)["low"])
         places = here[seen].astype(np.float32), there.astype(np.float32)
         parts.append(compare_light((task.index, number), pictures, places))
     return joined_samples(parts)
