@@ -273,9 +273,16 @@ def solve_symmetric(matrix: Array, right: Array) -> Array:
     count, sides = matrix.shape[0], right.shape[1]
     upper, found = matrix.T.copy(), right.copy()  # rows, along which a processor works on several
     for i in range(count):
+        for k in range(0, i - 3, 4):  # four rows at a time: one is written a quarter as often
+            a, b, c, d = upper[k, i], upper[k + 1, i], upper[k + 2, i], upper[k + 3, i]
+            for j in range(i, count):
+                upper[i, j] = (
+                    upper[i, j] - a * upper[k, j] - b * upper[k + 1, j]
+                    - c * upper[k + 2, j] - d * upper[k + 3, j]
+                )  # fmt: skip
         for k in range(i):
             share = upper[k, i]
-            for j in range(i, count):
+            for j in range(i, count if k >= i - i % 4 else i):
                 upper[i, j] -= share * upper[k, j]
             for m in range(sides):
                 found[i, m] -= share * found[k, m]

@@ -386,21 +386,25 @@ class PairMatch(NamedTuple):
 def as_partner(codes: NDArray[np.uint16]) -> NDArray[np.uint16]:
     """A map of disparity as the right virtual picture has it, both mirrored left to right.
 
-    Between neighbours in the left picture it is linear; where two surfaces fall on one pixel the
-    nearer one counts, and next to a step nothing is known.
+    Between neighbours in the left picture it is linear, and it ends half a pixel beyond the last;
+    where two surfaces fall on one pixel the nearer one counts.
     """
     height, width = codes.shape
     found = np.zeros_like(codes)
     for row in range(height):
-        for column in range(width - 1):
-            here, next_ = np.int64(codes[row, column]), np.int64(codes[row, column + 1])
-            if here == 0 or next_ == 0 or abs(next_ - here) >= _CODES:
+        goes_on = False
+        for column in range(width):
+            here = np.int64(codes[row, column])
+            after = np.int64(codes[row, min(column + 1, width - 1)])
+            start = _CODES * column - here  # where the right picture has it
+            first = start if goes_on else start - _CODES // 2 + 1
+            goes_on = here > 0 and after > 0 and 0 < _CODES + here - after < 2 * _CODES
+            span, rise = (_CODES + here - after, after - here) if goes_on else (_CODES // 2, 0)
+            if here == 0:
                 continue
-            span = _CODES + here - next_  # by which the two lie apart in the right picture
-            start = _CODES * column - here
-            for right in range(max(-(-start // _CODES), 0), (start + span) // _CODES + 1):
-                share = (_CODES * right - start) / span
-                code = np.uint16(here + share * (next_ - here) + 0.5)
+            for right in range(max(-(-first // _CODES), 0), (start + span) // _CODES + 1):
+                share = max(_CODES * right - start, 0) / span
+                code = np.uint16(here + share * rise + 0.5)
                 found[row, width - 1 - right] = max(found[row, width - 1 - right], code)
     return found
 

@@ -220,11 +220,10 @@ def moving_parts(look: Look, others: Sequence[Look]) -> tuple[Mask, float]:
     nothing = np.zeros(still.shape, np.bool_)
     depth = still[rows, columns]
     pixels: Array = (np.column_stack([columns, rows]).astype(np.float64) * 2 + 0.5) * look.step
-    points = look.view.at_depth(pixels, depth.astype(np.float64))
     own, places = fewer.light[rows, columns], pixels / look.view.pinhole.size_px
     shown, stations, sigmas = [], [], []
     for other in others:
-        cells, log_ratio = cells_at(points, depth, other)
+        cells, log_ratio = cells_at(look.view.show_in(other.view, pixels, depth), depth, other)
         known = np.flatnonzero(cells >= 0)
         if len(known) < _MIN_CELLS:
             continue
@@ -233,7 +232,7 @@ def moving_parts(look: Look, others: Sequence[Look]) -> tuple[Mask, float]:
         features = smooth_features(places, log_ratio)
         chosen = known[:: max(1, len(known) // _FITTED_CELLS)]
         fit, sigma = smooth_difference(features[chosen], own[chosen, 0] - there[chosen, 0])
-        there += np.einsum("nk,kc->nc", features, fit)[:, None].astype(np.float32)
+        there += (features @ fit)[:, None].astype(np.float32)
         shown.append(there)
         sigmas.append(sigma)
         stations.append(other.view.station)
@@ -265,16 +264,15 @@ def draw(look: Look, onto: Look) -> Array:
     """
     rows, columns = np.nonzero(np.isfinite(look.depth))
     pixels: Array = (np.column_stack([columns, rows]).astype(np.float64) + 0.5) * look.step
-    points = look.view.at_depth(pixels, look.depth[rows, columns].astype(np.float64))
-    depth = onto.view.world_from_cam.inv().apply(points)[:, 2]
-    at = np.floor(onto.view.project(points) / onto.step - 0.5)
-    found = np.full(onto.shape, np.inf)
-    for corner in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        place = at + corner
-        inside = ((place >= 0) & (place < onto.shape[::-1])).all(axis=1)  # NaN compares as False
-        column, row = place[inside].astype(np.int64).T
-        np.minimum.at(found, (row, column), depth[inside])
-    return np.where(np.isfinite(found), found, np.nan)
+    x, y, depth = look.view.show_in(onto.view, pixels, look.depth[rows, columns]).T
+    x, y = np.floor(x / onto.step - 0.5), np.floor(y / onto.step - 0.5)
+    height, width = onto.shape
+    found = np.full(height * width, np.inf)
+    for right, down in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        inside = (x >= -right) & (x < width - right) & (y >= -down) & (y < height - down)
+        cell = ((y[inside] + down) * width + x[inside] + right).astype(np.int64)
+        np.minimum.at(found, cell, depth[inside])
+    return np.where(np.isfinite(found), found, np.nan).reshape(height, width)
 
 
 def shared_depth(stack: Float32, stations: NDArray[np.int64], tolerance: float) -> Float32:
@@ -294,17 +292,21 @@ def shared_depth(stack: Float32, stations: NDArray[np.int64], tolerance: float) 
     return found
 
 
-def cells_at(points: Array, depth_here: Float32, other: Look) -> tuple[NDArray[np.int64], Array]:
-    """Cells of a view that show points (N, 3) which have some depth (N,) in another.
+def cells_at(there: Array, depth_here: Float32, other: Look) -> tuple[NDArray[np.int64], Array]:
+    """Cells of a view that show points which have some depth (N,) in another.
+
+    Args:
+        there: (N, 3) pixels and depths of the points in the view.
+        depth_here: (N,) in the other one.
+        other: the view.
 
     Returns:
         (N,) cells, counted by rows, -1 where none shows the point; and (N,) the logarithm of the
         point's depth in the other view over that in this one, 0 where none does.
     """
-    z = other.view.world_from_cam.inv().apply(points)[:, 2]
-    at = np.nan_to_num(other.view.project(points) / other.step, nan=-1.0)
-    inside = ((at >= 0) & (at < other.shape[::-1])).all(axis=1)
-    column, row = np.where(inside, at.T, 0).astype(np.int64)
+    x, y, z = there.T / np.array([[other.step], [other.step], [1.0]])
+    inside = (x >= 0) & (x < other.shape[1]) & (y >= 0) & (y < other.shape[0])
+    column, row = np.where(inside, (x, y), 0).astype(np.int64)
     inside &= other.usable[row, column]
     inside &= np.abs(other.depth[row, column] - z) <= _SAME_DEPTH * z
     log_ratio = np.log(np.where(inside, depth_here / z, 1.0))

@@ -276,20 +276,12 @@ def _normal(
     left, right = column - _REACH, column + _REACH
     if up < 0 or left < 0 or down >= depth.shape[0] or right >= depth.shape[1]:
         return 0.0, 0.0, 0.0, 0.0
-    a0, a1, a2 = _way(depth, slopes, row, left, row, right)
-    b0, b1, b2 = _way(depth, slopes, up, column, down, column)
+    west, east = depth[row, left], depth[row, right]
+    north, south = depth[up, column], depth[down, column]
+    a2, b2 = np.float64(east) - np.float64(west), np.float64(south) - np.float64(north)
+    a0 = np.float64(slopes[row, right, 0] * east) - np.float64(slopes[row, left, 0] * west)
+    a1 = np.float64(slopes[row, right, 1] * east) - np.float64(slopes[row, left, 1] * west)
+    b0 = np.float64(slopes[down, column, 0] * south) - np.float64(slopes[up, column, 0] * north)
+    b1 = np.float64(slopes[down, column, 1] * south) - np.float64(slopes[up, column, 1] * north)
     n0, n1, n2 = b1 * a2 - b2 * a1, b2 * a0 - b0 * a2, b0 * a1 - b1 * a0
     return n0, n1, n2, math.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
-
-
-@compiled(error_model="numpy", fastmath=FAST)
-def _way(
-    depth: Float32, slopes: Float32, row: int, column: int, to_row: int, to_column: int
-) -> tuple[float, float, float]:
-    """From the point of a pixel to that of another, in the camera; NaN where one is unknown."""
-    z, y = depth[to_row, to_column], depth[row, column]
-    return (
-        np.float64(slopes[to_row, to_column, 0] * z) - np.float64(slopes[row, column, 0] * y),
-        np.float64(slopes[to_row, to_column, 1] * z) - np.float64(slopes[row, column, 1] * y),
-        np.float64(z) - np.float64(y),
-    )

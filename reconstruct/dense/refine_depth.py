@@ -36,6 +36,7 @@ ALL: Share = (0, 1, 0, 1)
 
 _CONTRAST_SIGMA_PX = 8.0
 """Sigma of the Gaussian window in which pictures are brought to zero mean and unit contrast."""
+_QUARTER = 4
 _MIN_CONTRAST = 1.5
 """Grey levels of noise that are not blown up to full contrast."""
 WINDOW_SIGMA_PX = 1.25
@@ -89,10 +90,17 @@ def prepare(
 
 def even_contrast(grey: Float32) -> Float32:
     """A picture minus its local mean, over its local deviation."""
-    mean = _blur(grey, _CONTRAST_SIGMA_PX)
-    rest: Float32 = grey - mean
-    variance = _blur(rest * rest, _CONTRAST_SIGMA_PX) + np.float32(_MIN_CONTRAST**2)
+    rest: Float32 = grey - _level(grey)
+    variance = _level(rest * rest) + np.float32(_MIN_CONTRAST**2)
     return rest * (variance ** np.float32(-0.5))
+
+
+def _level(picture: Float32) -> Float32:
+    """Means in the window of contrast, of a picture at a quarter of its size: they are smooth."""
+    size = [max(1, -(-side // _QUARTER)) for side in picture.shape[::-1]]
+    small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+    small = _blur(small, _CONTRAST_SIGMA_PX / _QUARTER)
+    return np.asarray(cv2.resize(small, picture.shape[::-1], interpolation=cv2.INTER_LINEAR))
 
 
 def _blur(picture: Float32, sigma_px: float) -> Float32:

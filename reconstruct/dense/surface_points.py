@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
+from scipy.sparse import coo_matrix, csr_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
@@ -101,9 +101,12 @@ def surfaces_of(
     starts[parts] = count
     if parts == 1:
         return 1, surface
-    slopes = np.empty(parts)
+    slopes = np.full(parts, np.nan)  # the median of those known, the upper one of two
     for part in range(parts):
-        slopes[part] = _median_known(steepness, ranks[starts[part] : starts[part + 1]])
+        known = steepness[ranks[starts[part] : starts[part + 1]]]
+        known = known[~np.isnan(known)]
+        if known.size > 0:
+            slopes[part] = known[sorted_ranks(known)[known.size // 2]]
     kept = 1  # parts after those that a slope joins, whose starts move to the front
     for part in range(1, parts):
         below, above = ranks[starts[part] - 1], ranks[starts[part]]
@@ -121,7 +124,11 @@ def surfaces_of(
     surface[:] = -1
     for part in range(kept - 1, -1, -1):
         members = ranks[starts[part] : starts[part + 1]]
-        if members.size < _MIN_POINTS or _different(places, members) < _MIN_STATIONS:
+        stations = 1  # or more
+        for member in members:
+            if places[member] != places[members[0]]:
+                stations = _MIN_STATIONS
+        if members.size < _MIN_POINTS or stations < _MIN_STATIONS:
             continue
         for member in members:
             surface[member] = found
@@ -130,31 +137,6 @@ def surfaces_of(
         surface[:] = 0
         return 1, surface
     return found, surface
-
-
-@compiled
-def _median_known(values: Float32, members: NDArray[np.int64]) -> float:
-    """Median of those of some values that are known, the upper one of two; NaN of none."""
-    known = np.empty(members.size, np.float32)
-    count = 0
-    for member in members:
-        if not math.isnan(values[member]):
-            known[count] = values[member]
-            count += 1
-    if count == 0:
-        return np.nan
-    ranks = sorted_ranks(known[:count])
-    return float(known[ranks[count // 2]])
-
-
-@compiled
-def _different(values: NDArray[np.int64], members: NDArray[np.int64]) -> int:
-    """How many different values some members have, counted up to those needed."""
-    first = values[members[0]]
-    for member in members:
-        if values[member] != first:
-            return _MIN_STATIONS
-    return 1
 
 
 @compiled
@@ -309,12 +291,13 @@ def _fuse_along(
     if not len(order):
         return np.empty(0, SURFACE_POINT)
     at = [np.floor((points.enu[order, k] - origin[k]) / cell).astype(np.int64) for k in across]
-    for k in (1, 0):  # by cell, points of a cell in their order; small numbers are sorted fast
-        key = at[k] - at[k].min()
-        sort = np.argsort(key.astype(np.min_scalar_type(key.max())), kind="stable")
-        order, at = order[sort], [one[sort] for one in at]
-    starts = np.flatnonzero(np.concatenate([[True], np.any(np.diff(at), axis=0), [True]]))
-    cells = np.stack(at, axis=1)[starts[:-1]]
+    low, high = np.min(at, axis=1), np.max(at, axis=1)
+    rows, columns = (high - low + 1).tolist()
+    entries = (at[0] - low[0]) * columns + at[1] - low[1], np.arange(len(order))
+    by_cell = csr_array((np.ones(len(order), np.int8), entries), (rows * columns, len(order)))
+    filled = np.flatnonzero(np.diff(by_cell.indptr))
+    starts, order = np.append(by_cell.indptr[filled], len(order)), order[by_cell.indices]
+    cells = np.stack([filled // columns, filled % columns], axis=1) + low
     found = fuse_cells(
         starts, origin[across] + (cells + 0.5) * cell, points, order, stations, cell,
         (across[0], across[1], axis), sign, _GATE, shared,

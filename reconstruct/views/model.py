@@ -13,7 +13,7 @@ from alice_survey.core.contents import in_workspace, taken_from
 from alice_survey.core.frames import Array, Datum
 from alice_survey.core.records import CamerasRecord, FrameRecord, PlaceRecord
 from camera_calib.approximation.pinhole_warp import Pinhole, PinholeWarp, warp_from_json
-from reconstruct.views.range_shift import KernelLens, RangeShift, no_shift, range_shift
+from reconstruct.views.range_shift import KernelLens, RangeShift, carry, no_shift, range_shift
 
 MEAN_PLANE = "mean plane of the sea floor in the pictures"
 """Vertical datum of a model that its own surface puts level."""
@@ -83,6 +83,15 @@ class View:
         slopes = self.pinhole.slopes(self.shift.ideal(pixels, depth))
         points = np.column_stack([slopes * depth[:, None], depth])
         return np.asarray(self.world_from_cam.apply(points))
+
+    def show_in(self, other: "View", pixels: Array, depth: Array) -> Array:
+        """What pixels (N, 2) show at depths (N,) in another view: pixels and depths there, (N, 3).
+
+        A row is NaN behind the other camera.
+        """
+        move = (other.world_from_cam.inv() * self.world_from_cam).as_matrix()[:3]
+        lenses = self.kernel_lens, np.ascontiguousarray(move), other.kernel_lens
+        return carry(pixels, depth.astype(np.float64), *lenses)
 
     @property
     def kernel_lens(self) -> KernelLens:

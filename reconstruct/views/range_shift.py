@@ -215,6 +215,34 @@ def line_of(
 
 
 @compiled(error_model="numpy", fastmath=FAST)
+def carry(
+    pixels: Array, depth: Array, lens: KernelLens, other_from_here: Array, other_lens: KernelLens
+) -> Array:
+    """Where another view shows spots, and its depth of them, (N, 3); NaN behind its camera.
+
+    Args:
+        pixels: (N, 2) that show the spots here.
+        depth: (N,) of the spots here.
+        lens: of this view.
+        other_from_here: (3, 4) transform of points.
+        other_lens: of the other view.
+    """
+    found, t = np.full((depth.size, 3), np.nan), other_from_here
+    pinhole, field, inverse_working = other_lens
+    for i in range(depth.size):
+        line = line_of(lens[0], lens[1], lens[2], pixels[i, 0], pixels[i, 1])
+        z = depth[i]
+        x, y = z * line[0] + line[2], z * line[1] + line[3]
+        c = t[2, 0] * x + t[2, 1] * y + t[2, 2] * z + t[2, 3]
+        if c > 0.0:
+            u = (t[0, 0] * x + t[0, 1] * y + t[0, 2] * z + t[0, 3]) / c * pinhole[0] + pinhole[2]
+            v = (t[1, 0] * x + t[1, 1] * y + t[1, 2] * z + t[1, 3]) / c * pinhole[1] + pinhole[3]
+            found[i, 0], found[i, 1] = warped_at(field, inverse_working, u, v, 1.0 / c)
+            found[i, 2] = c
+    return found
+
+
+@compiled(error_model="numpy", fastmath=FAST)
 def slopes_of(
     depth: NDArray[np.float32], lens: KernelLens, top: int, left: int
 ) -> NDArray[np.float32]:

@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
-from reconstruct.dense.depth import match, pair_depth, without_mixed
+from reconstruct.dense.depth import match, match_pair, pair_depth, without_mixed
 from reconstruct.pictures.normalise import normalise
 from tests import oracles_dense
 
@@ -77,6 +77,29 @@ def test_depth_of_a_slope_with_a_step(heading_deg: float):
     assert 0.0005 < np.sqrt(np.nanmean(error**2)) < 0.015
     assert np.nanmedian(np.abs(error)) < np.nanmedian(sigma)
     assert abs(np.nanmedian(error)) < 0.0015
+
+
+def test_a_match_gives_the_depth_of_its_partner_as_well_as_one_the_other_way_round():
+    scene = oracles_dense.Scene(
+        depth_of=oracles_dense.sloped_with_step, paint=oracles_dense.speckle()
+    )
+    one, other = oracles_dense.stereo_views(np.array([0.1, 0.45]), np.array([0.3, 0.4]), 130.0)[:2]
+    here, there = ((normalise(oracles_dense.render(v, scene)), EVERYWHERE) for v in (one, other))
+    place = np.random.default_rng(1).uniform(-0.3, 0.9, (200, 2))
+    points = np.column_stack([place, oracles_dense.sloped_with_step(*place.T)])
+    true = other.world_from_cam.inv().apply(oracles_dense.hits(other, scene).reshape(-1, 3))[:, 2]
+    errors = [
+        depth.depth - true.reshape(depth.depth.shape)
+        for depth in (
+            pair_depth((other, one), (there, here), points),
+            match_pair((one, other), (here, there), points).swap().depth(other, one),
+        )
+    ]
+    own, swapped = (error[np.isfinite(error)] for error in errors)
+    assert 0.97 * own.size < swapped.size < 1.01 * own.size
+    assert abs(np.median(swapped)) < 3e-4
+    assert np.median(np.abs(swapped)) < 1.1 * np.median(np.abs(own))
+    assert np.sqrt(np.mean(swapped**2)) < 0.012
 
 
 def test_masked_pixels_get_no_depth():

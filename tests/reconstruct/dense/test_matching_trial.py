@@ -6,7 +6,6 @@ import pytest
 
 from alice_survey.core.block_solver import MAD_TO_SIGMA
 from alice_survey.core.executor import SERIAL
-from alice_survey.core.frames import Array
 from reconstruct.dense.depth import enlarge
 from reconstruct.dense.matching_trial import find_scales, scale_for_cell
 from reconstruct.dense.stereo_pairs import choose_partners
@@ -14,9 +13,10 @@ from reconstruct.dense.view_store import ViewStore
 from reconstruct.dense.views import (
     ViewTask,
     find_match_sigma,
+    match_view,
+    pairs_once,
     prepare_view,
     refine_view,
-    view_depth,
 )
 from reconstruct.mosaic.grid import mean_pixel
 from reconstruct.views.model import points_of_views, scaled_view
@@ -37,22 +37,28 @@ def conditions(workspace: Path, model, folder: Path) -> tuple[float, float]:
     partners, points = choose_partners(model, 3), points_of_views(model)
     scales = find_scales(workspace, model.views, partners, points.__getitem__, 1.0, SERIAL)
     assert scales.matching == scales.depth
-    tasks = matched(workspace, model, scales.depth, folder)
+    tasks = matched(workspace, model, scales.depth, 1.0, folder)
     return scales.depth, find_match_sigma(1.0, tasks[:2], SERIAL)
 
 
-def matched(workspace: Path, model, scale: float, folder: Path) -> list[tuple[ViewTask, Array]]:
-    """All views with their partners, prepared."""
+def matched(workspace: Path, model, scale: float, matching: float, folder: Path) -> list[ViewTask]:
+    """All views with their partners, matched at a scale."""
     views = [scaled_view(view, scale) for view in model.views]
     store = ViewStore(folder)
     folder.mkdir()
-    tasks = [
-        ViewTask(store=store, index=n, view=views[n], others=tuple((m, views[m]) for m in chosen))
-        for n, chosen in enumerate(choose_partners(model, 3))
-    ]
+    partners = choose_partners(model, 3)
+    tasks, once = (
+        [
+            ViewTask(store=store, index=n, view=views[n], others=tuple((m, views[m]) for m in own))
+            for n, own in enumerate(others)
+        ]
+        for others in (partners, pairs_once(partners))
+    )
     for task in tasks:
         prepare_view(workspace, task)
-    return list(zip(tasks, points_of_views(model), strict=True))
+    for one in zip(once, points_of_views(model), strict=True):
+        match_view(matching, one)
+    return tasks
 
 
 def test_clear_pictures_are_matched_as_they_are_and_better_than_assumed(survey, tmp_path):
@@ -66,12 +72,10 @@ def test_depth_matched_in_smaller_pictures_is_as_exact_once_it_is_refined(survey
     workspace, model = survey
     shares, errors = [], []
     for scale in (1.0, 0.5, 0.25):
-        tasks = matched(workspace, model, 1.0, tmp_path / f"{scale}")
-        store, view = tasks[0][0].store, model.views[0]
-        view_depth(scale, 0.3, tasks[0])
-        assert store.load(0, "depth").shape == scaled_view(view, scale).pinhole.size_px[::-1]
-        refine_view(scale, tasks[0][0])
-        depth, sigma = store.load_depth(0, "fine")
+        tasks = matched(workspace, model, 1.0, scale, tmp_path / f"{scale}")
+        store, view = tasks[1].store, model.views[1]
+        refine_view(scale, 0.3, tasks[1])
+        depth, sigma = store.load_depth(1, "fine")
         points = view.world_from_cam.inv().apply(hits(view, SCENE).reshape(-1, 3))
         error = (depth - points[:, 2].reshape(depth.shape)) / sigma
         shares.append(np.isfinite(depth).mean())

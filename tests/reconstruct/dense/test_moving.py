@@ -178,8 +178,9 @@ def test_cells_show_points_that_lie_at_their_depth():
     z = rng.uniform(1.1, 1.3, len(pixels))
     points = one.at_depth(pixels, z)
     here = (1.5 + 0.001 * np.arange(len(points))).astype(np.float32)
+    there = np.column_stack([one.project(points), z])
     cells, log_ratio = moving.cells_at(
-        points, here, look_of(one, depth, step)._replace(usable=usable)
+        there, here, look_of(one, depth, step)._replace(usable=usable)
     )
 
     columns, rows = np.floor(pixels / step).astype(int).T

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from reconstruct.dense.points import block_bounds, part_in_box, points_in_box, points_of_pixels
-from reconstruct.dense.view_store import ViewStore
+from reconstruct.dense.view_store import ViewStore, pack, pack_mask
 from reconstruct.pictures.undistorted import WHOLE
 from reconstruct.views.range_shift import no_shift
 from tests import oracles_dense
@@ -99,7 +99,7 @@ def test_the_part_of_a_view_that_meets_a_box_gives_what_the_whole_view_gives(tmp
     colour = cv2.GaussianBlur(rng.integers(0, 255, (*depth.shape, 3), np.uint8), (0, 0), 2.0)
     store = ViewStore(tmp_path)
     store.save_depth(7, "fine", depth, np.full_like(depth, 0.01))
-    store.save_mask(7, "inside", rng.random(depth.shape) > 0.1)
+    store.save(7, "checked", pack(inside=pack_mask(rng.random(depth.shape) > 0.1)))
     store.save_colour(7, colour)
     chosen = np.isfinite(depth) & (rng.random(depth.shape) > 0.3)
     rows, columns = np.nonzero(chosen)
@@ -113,7 +113,8 @@ def test_the_part_of_a_view_that_meets_a_box_gives_what_the_whole_view_gives(tmp
     def points(box, part):
         return points_in_box(
             view, 7, *store.load_depth(7, "fine", part),
-            store.load_mask(7, "inside", view.pinhole.width_px, part), store.load_colour(7, part),
+            store.load_mask(7, "checked", "inside", view.pinhole.width_px, part),
+            store.load_colour(7, part),
             factors, OFFSET, box, blocks, part,
         )  # fmt: skip
 

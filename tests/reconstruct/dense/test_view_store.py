@@ -2,7 +2,7 @@ from pathlib import Path
 
 import numpy as np
 
-from reconstruct.dense.view_store import ViewStore
+from reconstruct.dense.view_store import ViewStore, pack_mask
 
 
 def test_depth_comes_back_within_a_fiftieth_of_a_millimetre(tmp_path: Path):
@@ -48,11 +48,15 @@ def test_colours_keep_brightness_and_masks_every_bit(tmp_path: Path):
     mask = rng.random((41, 53)) < 0.5
     store = ViewStore(tmp_path)
 
-    store.save_colour(1, colour)
-    store.save_mask(1, "kept", mask)
+    store.save_colour(1, colour, valid=pack_mask(mask))
+    assert store.has(1, "picture") and not store.has(2, "picture")
 
     error = store.load_colour(1).astype(float) - colour
     assert 0.1 < np.sqrt(np.mean(error**2)) < 4.0
-    np.testing.assert_array_equal(store.load_mask(1, "kept", 53), mask)
+    np.testing.assert_array_equal(store.load_mask(1, "picture", "valid", 53), mask)
     sizes = sum(path.stat().st_size for path in tmp_path.iterdir())
     assert sizes < 1.7 * mask.size + 600
+    content = store.path(1, "picture").read_bytes()
+    for lost in (b"", content[:900], content[:900] + bytes(len(content) - 900)):  # by a power cut
+        store.path(1, "picture").write_bytes(lost)
+        assert not store.has(1, "picture")
