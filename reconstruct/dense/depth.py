@@ -181,17 +181,10 @@ def depth_in_reference(
 
 @compiled(error_model="numpy", fastmath=FAST)
 def triangulate(
-    disparity_px: NDArray[np.float32],
-    shape: tuple[int, int],
-    reference: KernelLens,
-    partner: KernelLens,
-    rect_from_reference: Array,
-    rect_from_partner: Array,
-    partner_from_rect: Array,
-    cosines: Array,
-    focal_baseline: float,
-    offset_px: float,
-) -> NDArray[np.float32]:
+    disparity_px: NDArray[np.float32], shape: tuple[int, int], reference: KernelLens,
+    partner: KernelLens, rect_from_reference: Array, rect_from_partner: Array,
+    partner_from_rect: Array, cosines: Array, focal_baseline: float, offset_px: float,
+) -> NDArray[np.float32]:  # fmt: skip
     """Depth of every pixel from the two refracted rays of its match.
 
     A match says which pixels p and q of the two warped pictures show one spot. Where the pinholes
@@ -390,12 +383,11 @@ def as_partner(codes: NDArray[np.uint16]) -> NDArray[np.uint16]:
     where two surfaces fall on one pixel the nearer one counts.
     """
     height, width = codes.shape
-    found = np.zeros_like(codes)
+    found, wide = np.zeros_like(codes), codes.astype(np.int64)
     for row in range(height):
         goes_on = False
         for column in range(width):
-            here = np.int64(codes[row, column])
-            after = np.int64(codes[row, min(column + 1, width - 1)])
+            here, after = int(wide[row, column]), int(wide[row, min(column + 1, width - 1)])
             start = _CODES * column - here  # where the right picture has it
             first = start if goes_on else start - _CODES // 2 + 1
             goes_on = here > 0 and after > 0 and 0 < _CODES + here - after < 2 * _CODES
@@ -529,15 +521,9 @@ def merge_depths(
 
 @compiled(error_model="numpy", fastmath=FAST)
 def count_confirming(
-    depth: Float32,
-    sigma: Float32,
-    slopes: Float32,
-    other_from_ref: Array,
-    other: StoredDepth,
-    factor: float,
-    other_lens: KernelLens,
-    gate: float,
-) -> tuple[NDArray[np.int8], NDArray[np.int8]]:
+    depth: Float32, sigma: Float32, slopes: Float32, other_from_ref: Array, other: StoredDepth,
+    factor: float, other_lens: KernelLens, gate: float,
+) -> tuple[NDArray[np.int8], NDArray[np.int8]]:  # fmt: skip
     """See which depths another view confirms and which it sees through.
 
     Args:

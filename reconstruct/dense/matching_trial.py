@@ -82,13 +82,9 @@ def choose_probes(partners: Sequence[Sequence[int]]) -> list[int]:
 
 
 def find_scales(
-    workspace: Path,
-    views: Sequence[View],
-    partners: Sequence[Sequence[int]],
-    points_of: Callable[[int], Array],
-    finest: float,
-    executor: Executor,
-) -> Scales:
+    workspace: Path, views: Sequence[View], partners: Sequence[Sequence[int]],
+    points_of: Callable[[int], Array], finest: float, executor: Executor,
+) -> Scales:  # fmt: skip
     """At which scale to match, and whether detail that is finer than that is worth refining.
 
     Where a few views find more depths at a lower resolution, what is finer is noise.

@@ -1,7 +1,7 @@
 """Depth maps as points with normals and colours, in local east, north, up."""
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,11 +41,6 @@ class Points(NamedTuple):
     views: NDArray[np.int32]
     """(N,) number of the view, in ascending order."""
 
-    def part(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> "Points":
-        """Those of the points that a mask or their numbers choose."""
-        every: list[Any] = [*self]
-        return Points(*(values[chosen] for values in every))
-
 
 def part_in_box(
     view: View, offset_enu: Array, box: tuple[float, float, float, float], blocks: Float32
@@ -73,18 +68,10 @@ def part_in_box(
 
 
 def points_in_box(
-    view: View,
-    number: int,
-    depth: Float32,
-    sigma: Float32,
-    kept: NDArray[np.bool_],
-    colour: NDArray[np.uint8],
-    factors: Float32,
-    offset_enu: Array,
-    box: tuple[float, float, float, float],
-    blocks: Float32,
-    part: Part = WHOLE,
-) -> Points:
+    view: View, number: int, depth: Float32, sigma: Float32, kept: NDArray[np.bool_],
+    colour: NDArray[np.uint8], factors: Float32, offset_enu: Array,
+    box: tuple[float, float, float, float], blocks: Float32, part: Part = WHOLE,
+) -> Points:  # fmt: skip
     """The kept points of a depth map inside of a box.
 
     Args:
@@ -179,17 +166,10 @@ def join_points(parts: list[Points]) -> Points:
 
 @compiled(error_model="numpy", fastmath=FAST)
 def gather(
-    depth: Float32,
-    sigma: Float32,
-    kept: NDArray[np.bool_],
-    colour: NDArray[np.uint8],
-    factors: Float32,
-    lens: KernelLens,
-    enu_from_cam: Array,
-    box: Array,
-    meeting: NDArray[np.bool_],
+    depth: Float32, sigma: Float32, kept: NDArray[np.bool_], colour: NDArray[np.uint8],
+    factors: Float32, lens: KernelLens, enu_from_cam: Array, box: Array, meeting: NDArray[np.bool_],
     frame: tuple[int, int, int, int],
-) -> tuple[Float32, Float32, NDArray[np.uint8], Float32]:
+) -> tuple[Float32, Float32, NDArray[np.uint8], Float32]:  # fmt: skip
     """Points, normals, colours (RGB) and standard deviations of pixels whose point is in a box.
 
     Errors of the depth move a point along its ray; along the normal they count with the cosine

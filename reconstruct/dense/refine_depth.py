@@ -150,18 +150,10 @@ def _spline(t: np.float32) -> tuple[_Weights, _Weights]:
 
 @compiled(error_model="numpy", fastmath=FAST)
 def compare(
-    share: Share,
-    inverse_depth: Float32,
-    reference: Float32,
-    lines: Float32,
-    spline: Float32,
-    valid: NDArray[np.bool_],
-    other_lens: KernelLens,
-    other_from_ref: Array,
-    rest: Float32,
-    slope: Float32,
-    speed: Float32,
-) -> None:
+    share: Share, inverse_depth: Float32, reference: Float32, lines: Float32, spline: Float32,
+    valid: NDArray[np.bool_], other_lens: KernelLens, other_from_ref: Array, rest: Float32,
+    slope: Float32, speed: Float32,
+) -> None:  # fmt: skip
     """Warp a neighbour onto the reference through its depth.
 
     Args:
@@ -312,13 +304,9 @@ def _reference(reference: ComparedView, rows: slice, device: Device) -> _Referen
 
 
 def refine(
-    reference: ComparedView,
-    depth: Float32,
-    sigma: Float32,
-    others: Sequence[ComparedView],
-    spare: Sequence[ComparedView] = (),
-    device: Device = PROCESSOR,
-) -> RefinedDepth:
+    reference: ComparedView, depth: Float32, sigma: Float32, others: Sequence[ComparedView],
+    spare: Sequence[ComparedView] = (), device: Device = PROCESSOR,
+) -> RefinedDepth:  # fmt: skip
     """Correct a depth map by all neighbours at once.
 
     A window that holds a step of the surface has no single correction: there the depth and its
@@ -446,13 +434,9 @@ def _sums(one: _Reference, inverse: Float32, others: Sequence[_Look]) -> _Neighb
 
 @compiled(error_model="numpy", fastmath=FAST)
 def weigh(
-    share: Share,
-    rest: Float32,
-    slope: Float32,
-    known: NDArray[np.bool_],
-    outlying: float,
+    share: Share, rest: Float32, slope: Float32, known: NDArray[np.bool_], outlying: float,
     products: Float32,
-) -> None:
+) -> None:  # fmt: skip
     """Weights, falling with the square of what is left (Cauchy), and weighted products.
 
     Args:
@@ -479,19 +463,10 @@ def weigh(
 
 @compiled(error_model="numpy", fastmath=FAST)
 def add(
-    share: Share,
-    products: Float32,
-    spread: Float32,
-    fast: Float32,
-    known: NDArray[np.bool_],
-    noise: float,
-    samples: float,
-    pull: Float32,
-    curvature: Float32,
-    speed: Float32,
-    likeness: Float32,
-    seen: NDArray[np.uint8],
-) -> None:
+    share: Share, products: Float32, spread: Float32, fast: Float32, known: NDArray[np.bool_],
+    noise: float, samples: float, pull: Float32, curvature: Float32, speed: Float32,
+    likeness: Float32, seen: NDArray[np.uint8],
+) -> None:  # fmt: skip
     """Add one neighbour's normal equations to the totals, each over the variance it leaves.
 
     Means over the window are taken out, so that brightness does not count; a window that hardly

@@ -39,12 +39,9 @@ _REACH_SIGMAS = 4
 
 
 def refine_on_gpu(
-    reference: ComparedView,
-    depth: Float32,
-    sigma: Float32,
-    others: Sequence[ComparedView],
+    reference: ComparedView, depth: Float32, sigma: Float32, others: Sequence[ComparedView],
     spare: Sequence[ComparedView] = (),
-) -> RefinedDepth:
+) -> RefinedDepth:  # fmt: skip
     """As `refine`, by as many processes of a user at a time as the GPU has memory for.
 
     Where memory does not suffice after all, the processor does it. Depths differ from those of the

@@ -92,14 +92,9 @@ _RIM = FILL_CELLS + STRAY_CELLS + 3
 
 
 def fuse_planes(
-    setup: FuseSetup,
-    model: SparseModel,
-    summaries: Sequence[ViewSummary],
-    poses: ErrorsOfPoses | None,
-    folder: Path,
-    cell_m: float | None,
-    executor: Executor,
-) -> list[tuple[Plane, DemGrid]]:
+    setup: FuseSetup, model: SparseModel, summaries: Sequence[ViewSummary],
+    poses: ErrorsOfPoses | None, folder: Path, cell_m: float | None, executor: Executor,
+) -> list[tuple[Plane, DemGrid]]:  # fmt: skip
     """Fuse the surface, and write the cloud and the rasters of planes.
 
     The first plane on which something is seen has its rasters in the folder itself, the others
@@ -175,14 +170,9 @@ def _offset(grid: DemGrid, summaries: Sequence[ViewSummary]) -> tuple[float, flo
 
 
 def _project(
-    setup: FuseSetup,
-    tiles: Sequence[SurfaceTile],
-    folder: Path,
-    plane: Plane,
-    grid: DemGrid,
-    frame: WorldFrame,
-    executor: Executor,
-) -> None:
+    setup: FuseSetup, tiles: Sequence[SurfaceTile], folder: Path, plane: Plane, grid: DemGrid,
+    frame: WorldFrame, executor: Executor,
+) -> None:  # fmt: skip
     """Write one plane's rasters."""
     tasks = []
     margin = (_RIM + 1) * grid.cell
@@ -239,12 +229,9 @@ def project_tile(
 
 
 def _write_rasters(
-    folder: Path,
-    grid: DemGrid,
-    frame: WorldFrame,
-    tiles: Iterable[tuple[Window, Mapping[str, NDArray[Any]]]],
-    threads: int,
-) -> None:
+    folder: Path, grid: DemGrid, frame: WorldFrame,
+    tiles: Iterable[tuple[Window, Mapping[str, NDArray[Any]]]], threads: int,
+) -> None:  # fmt: skip
     up = "towards its viewer" if frame.name == "plane" else "up"
     over = f"above {frame.vertical_datum}, {up} ({frame.unit})"
     with ExitStack() as files:
@@ -365,13 +352,9 @@ def run_dense(
 
 
 def _scales(
-    workspace: Path,
-    model: SparseModel,
-    partners: Sequence[Sequence[int]],
-    points: PointsInSight,
-    reconstruct: ReconstructConfig,
-    executor: Executor,
-) -> Scales:
+    workspace: Path, model: SparseModel, partners: Sequence[Sequence[int]], points: PointsInSight,
+    reconstruct: ReconstructConfig, executor: Executor,
+) -> Scales:  # fmt: skip
     """As settings want them; what they leave open is tried out."""
     if reconstruct.dense_scale is not None:
         requested = reconstruct.dense_scale

@@ -141,13 +141,9 @@ def surfaces_of(
 
 @compiled
 def robust_height(
-    heights: Float32,
-    sigmas: Float32,
-    views: NDArray[np.int32],
-    stations: NDArray[np.int64],
-    gate: float,
-    shared: float,
-) -> tuple[float, float, int, int]:
+    heights: Float32, sigmas: Float32, views: NDArray[np.int32], stations: NDArray[np.int64],
+    gate: float, shared: float,
+) -> tuple[float, float, int, int]:  # fmt: skip
     """Robust height of some points: the weighted mean of what lies near the median.
 
     The gate around the median is `gate` times the larger of the scatter (from the MAD) and the
@@ -278,14 +274,9 @@ def fuse_surface(
 
 
 def _fuse_along(
-    points: Points,
-    stations: NDArray[np.int64],
-    cell: float,
-    origin: Array,
-    shared: float,
-    axis: int,
-    sign: float,
-) -> NDArray[Any]:
+    points: Points, stations: NDArray[np.int64], cell: float, origin: Array, shared: float,
+    axis: int, sign: float,
+) -> NDArray[Any]:  # fmt: skip
     across = [k for k in range(3) if k != axis]
     order = np.flatnonzero(sign * points.normals[:, axis] >= _MIN_ALONG)
     if not len(order):

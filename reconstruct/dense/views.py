@@ -152,7 +152,7 @@ def match_view(scale: float, matched: tuple[ViewTask, Array]) -> None:
         smalls.append(scaled_view(view, scale))
         size_px = smalls[-1].pinhole.size_px
         looks.append(_even_picture(task.store, number, view.pinhole.size_px, size_px))
-    pairs = {"view": np.int64(task.index)}
+    pairs: dict[str, Any] = {"view": task.index}
     for (number, _), small, look in zip(task.others, smalls[1:], looks[1:], strict=True):
         found = match_pair((smalls[0], small), (looks[0], look), points_world)
         if found is not None:
@@ -184,23 +184,9 @@ def _pair(store: ViewStore, view: int, partner: int) -> PairMatch | None:
     pairs = store.load(view, _PAIRS)
     if str(partner) not in (pairs.dtype.names or ()):
         return None
-    kept = {name: np.array(pairs[str(partner)][name]) for name in _FIELDS}
+    kept: dict[str, Any] = {name: np.array(pairs[str(partner)][name]) for name in _FIELDS}
     pair = {name: value if value.shape else value.item() for name, value in kept.items()}
     return PairMatch(Rectification(**pair), np.asarray(pairs[str(partner)]["codes"]))
-
-
-def _merged(
-    scale: float, match_sigma_px: float, task: ViewTask
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
-    """Depth of a view on which its partners agree, its deviation, and how many do."""
-    depths = _pair_depths(scale, task)
-    if depths:
-        found = np.stack([one.depth for one in depths])
-        sigmas = np.stack([one.sigma(match_sigma_px) for one in depths])
-        return merge_depths(found, sigmas, GATE_SIGMAS)
-    shape = scaled_view(task.view, scale).pinhole.size_px[::-1]
-    unknown = np.full(shape, np.nan, np.float32)
-    return unknown, unknown, np.zeros(shape, np.uint8)
 
 
 def _compared_view(store: ViewStore, scale: float, number: int, view: View) -> ComparedView:
@@ -239,7 +225,11 @@ def refine_view(
     apart = [other for other in task.others if other[1].station != task.view.station]
     rig = [other for other in task.others if other[1].station == task.view.station]
     first, spare = (apart, rig) if len(apart) >= _ENOUGH_APART else (task.others, [])
-    depth, sigma, agreeing = _merged(scale, match_sigma_px, task)
+    depths = _pair_depths(scale, task)
+    shape = len(depths), *scaled_view(task.view, scale).pinhole.size_px[::-1]
+    found = np.array([one.depth for one in depths], np.float32).reshape(shape)
+    sigmas = np.array([one.sigma(match_sigma_px) for one in depths], np.float32).reshape(shape)
+    depth, sigma, agreeing = merge_depths(found, sigmas, GATE_SIGMAS)
     if on_gpu:
         from reconstruct.dense.refine_gpu import refine_on_gpu as refined_by
     else:

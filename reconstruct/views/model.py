@@ -84,7 +84,7 @@ class View:
         points = np.column_stack([slopes * depth[:, None], depth])
         return np.asarray(self.world_from_cam.apply(points))
 
-    def show_in(self, other: "View", pixels: Array, depth: Array) -> Array:
+    def show_in(self, other: "View", pixels: Array, depth: NDArray[Any]) -> Array:
         """What pixels (N, 2) show at depths (N,) in another view: pixels and depths there, (N, 3).
 
         A row is NaN behind the other camera.
