@@ -230,6 +230,7 @@ def refine_view(
     found = np.array([one.depth for one in depths], np.float32).reshape(shape)
     sigmas = np.array([one.sigma(match_sigma_px) for one in depths], np.float32).reshape(shape)
     depth, sigma, agreeing = merge_depths(found, sigmas, GATE_SIGMAS)
+    del depths, found, sigmas
     if on_gpu:
         from reconstruct.dense.refine_gpu import refine_on_gpu as refined_by
     else:
