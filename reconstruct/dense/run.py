@@ -298,8 +298,7 @@ def run_dense(
     checks = tasks(neighbours(model, _CHECKING))
     sigma_factor = find_sigma_factor(checks, executor)
     check = partial(check_view, sigma_factor)
-    checked = executor.map(check, checks, label="cross-check")
-    nodes, samples, summaries = zip(*checked, strict=True)
+    nodes, samples, summaries = zip(*executor.map(check, checks, label="cross-check"), strict=True)
     images, cameras = [view.image for view in views], [view.camera for view in views]
     light = solve_light(light_parts(store, samples, executor), np.stack(nodes), images, cameras)
     write_light(folder / "light.json", light)

@@ -33,8 +33,6 @@ _APART_SIGMAS = 5.0
 """Noise in a gap between heights, in standard deviations of the points on its two sides."""
 _DIAGONAL = math.sqrt(2.0)
 _MIN_POINTS = 3
-_MIN_STATIONS = 2
-"""A surface is seen from as many; what fewer see may be one wrong match."""
 
 
 @compiled
@@ -124,11 +122,8 @@ def surfaces_of(
     surface[:] = -1
     for part in range(kept - 1, -1, -1):
         members = ranks[starts[part] : starts[part + 1]]
-        stations = 1  # or more
-        for member in members:
-            if places[member] != places[members[0]]:
-                stations = _MIN_STATIONS
-        if members.size < _MIN_POINTS or stations < _MIN_STATIONS:
+        alone = places[members] == places[members[0]]  # what one station sees may be a wrong match
+        if members.size < _MIN_POINTS or alone.all():
             continue
         for member in members:
             surface[member] = found

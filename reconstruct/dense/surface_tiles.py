@@ -365,7 +365,6 @@ def _points_over(
         with np.errstate(invalid="ignore"):
             sure = sigma <= _WORST_CELLS * task.grid.cell
         kept = store.load_mask(index, CHECKED, "inside", view.pinhole.width_px, part) & sure
-        colour = store.load_colour(index, part)
-        maps = depth, sigma, kept, colour, np.array(factors[index])
+        maps = depth, sigma, kept, store.load_colour(index, part), np.array(factors[index])
         found.append(points_in_box(view, index, *maps, offset, sides, blocks, part))
     return join_points(found)

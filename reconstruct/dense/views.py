@@ -6,7 +6,7 @@ and leaves its own there.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from itertools import pairwise
 from pathlib import Path
@@ -67,9 +67,6 @@ _COMPARED_STEP_PX = 7
 """Views, and pixels between the pixels of each, by which the sigma factor is measured."""
 _MIN_PIXELS = 100
 """A view with fewer pixels of confirmed depth is left out."""
-
-
-_FIELDS = [field.name for field in fields(Rectification)]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -184,9 +181,11 @@ def _pair(store: ViewStore, view: int, partner: int) -> PairMatch | None:
     pairs = store.load(view, _PAIRS)
     if str(partner) not in (pairs.dtype.names or ()):
         return None
-    kept: dict[str, Any] = {name: np.array(pairs[str(partner)][name]) for name in _FIELDS}
-    pair = {name: value if value.shape else value.item() for name, value in kept.items()}
-    return PairMatch(Rectification(**pair), np.asarray(pairs[str(partner)]["codes"]))
+    kept = pairs[str(partner)]
+    pair: dict[str, Any] = {name: np.array(kept[name]) for name in kept.dtype.names or ()}
+    codes = pair.pop("codes")
+    numbers = {name: value.item() for name, value in pair.items() if not value.shape}
+    return PairMatch(Rectification(**pair | numbers), codes)
 
 
 def _compared_view(store: ViewStore, scale: float, number: int, view: View) -> ComparedView:
@@ -226,11 +225,10 @@ def refine_view(
     rig = [other for other in task.others if other[1].station == task.view.station]
     first, spare = (apart, rig) if len(apart) >= _ENOUGH_APART else (task.others, [])
     depths = _pair_depths(scale, task)
-    shape = len(depths), *scaled_view(task.view, scale).pinhole.size_px[::-1]
-    found = np.array([one.depth for one in depths], np.float32).reshape(shape)
-    sigmas = np.array([one.sigma(match_sigma_px) for one in depths], np.float32).reshape(shape)
-    depth, sigma, agreeing = merge_depths(found, sigmas, GATE_SIGMAS)
-    del depths, found, sigmas
+    shape = 2, len(depths), *scaled_view(task.view, scale).pinhole.size_px[::-1]
+    both = [one.depth for one in depths], [one.sigma(match_sigma_px) for one in depths]
+    depth, sigma, agreeing = merge_depths(*np.array(both, np.float32).reshape(shape), GATE_SIGMAS)
+    del depths, both
     if on_gpu:
         from reconstruct.dense.refine_gpu import refine_on_gpu as refined_by
     else:
