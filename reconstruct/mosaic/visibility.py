@@ -114,12 +114,9 @@ def find_occluders(
     find = partial(_off_heights, cloud, plane, dem, folder)
     found = executor.map(find, parts, label=label, task_mib=_TASK_MIB)
     kept = [(number, *sphere) for number, sphere in enumerate(found) if sphere is not None]
-    with (
-        atomic_path(folder / "index.npz", lasting=False) as temporary,
-        temporary.open("wb") as file,
-    ):
+    with atomic_path(folder / "index.npz", lasting=False) as temporary:
         np.savez(
-            file,
+            temporary,
             numbers=np.array([number for number, *_ in kept], np.int64),
             centres=np.array([centre for _, centre, _ in kept]).reshape(-1, 3),
             radii=np.array([radius for *_, radius in kept]),
