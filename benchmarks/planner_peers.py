@@ -20,9 +20,9 @@ from missions.lines.lay import LineTask, lay_lines
 from missions.route.turns import Manoeuvre, legs_through, line_table, route_of
 from missions.route.ways import Ways
 from missions.values.area import Area
-from missions.values.costs import time_costs
 from missions.values.line import Line
 from missions.values.pattern import Pattern
+from tests.oracles_route import time_costs
 
 PATTERN = Pattern(spacing_m=1.0, step_m=0.47, half_across_m=0.6, half_along_m=0.57)
 """Lines 1 m apart, near the paper's stereo pair at 2 m."""

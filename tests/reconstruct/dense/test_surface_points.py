@@ -174,7 +174,7 @@ def test_tiles_agree_where_they_meet():
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     points = seen(0.2 * normals, normals, rng)
     whole = fused_from(points)
-    part = fused_from(type(points)(*(values[points.enu[:, 0] < 5 * CELL_M] for values in points)))
+    part = fused_from(Points._make(values[points.enu[:, 0] < 5 * CELL_M] for values in points))
 
     def own(found: np.ndarray) -> np.ndarray:
         return np.sort(found[found["enu"][:, 0] < 4 * CELL_M], order=("enu", "normal"))

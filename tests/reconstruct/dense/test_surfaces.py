@@ -56,7 +56,7 @@ def sheet(
 def together(*sheets: Points) -> Points:
     """Points of several sheets, in the order of their views."""
     joined = join_points(list(sheets))
-    return type(joined)(*(values[np.argsort(joined.views, kind="stable")] for values in joined))
+    return Points._make(values[np.argsort(joined.views, kind="stable")] for values in joined)
 
 
 def fused(points: Points, cells: int = 30) -> FusedCells:
