@@ -247,9 +247,7 @@ DENSE = StageSpec(
     work="reconstruct.dense.run:run_dense",
     takes=("reconstruct",),
     needs=("image", "placing"),
-    settings=only(
-        "reconstruct", "dense_scale", "dense_partners", "dem_cell_m", "planes", "mask_moving"
-    ),
+    settings=only("reconstruct", "dense_scale", "dem_cell_m", "planes", "mask_moving"),
     inputs=_model_inputs,
     summary=_dense_summary,
     resumes=True,
