@@ -285,9 +285,16 @@ class Run:
             done = {name: s for name, s in before.items() if name not in left and stage == last}
             step = self._compiling
             if done:
-                self._compiled_s = self.clock()
+                last_s, self._compiled_s, seconds = (
+                    self._compiled_s,
+                    self.clock(),
+                    sum(done.values()),
+                )
+                if step is not None and step.task.start_time is not None:  # a pause does not count
+                    pause_s = self._compiled_s - last_s - seconds / (step.task.speed or 1.0)
+                    step.task.start_time += max(pause_s, 0.0)
                 step = self._compiling = step or self.begin_step(_COMPILES, len(before))
-                step.done, seconds = (step.done or 0) + len(done), sum(done.values())
+                step.done = (step.done or 0) + len(done)
                 step.total = step.done + len(left)
                 step.task.total = step.task.completed + seconds + sum(left.values())
                 self.advance(step, 0, seconds)
@@ -296,6 +303,7 @@ class Run:
                 idle_s = self.clock() - self._compiled_s
                 step.begun_s = min(idle_s, kernel_s)
                 if not left or stage != last or idle_s > _IDLE_S + 2.0 * kernel_s:
+                    step.task.stop_time = self._compiled_s
                     self.end_step(step, complete=True)
                     self._compiling = None
 
