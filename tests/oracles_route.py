@@ -22,19 +22,8 @@ from missions.values.line import Line
 
 def time_costs(speed_mps: float) -> Costs:
     """Costs of 1 W whatever the vehicle does: joules are seconds."""
-    return Costs(
-        speed_mps=speed_mps,
-        line_w=np.ones(4),
-        way_w=np.ones(4),
-        stop_w=1.0,
-        arc_extra_w=0.0,
-        turn_rate_rad_s=TURN_IN_PLACE_RAD_S,
-        settle_s=SETTLE_S,
-        sway_mps=STEP_MPS,
-        sway_w=np.ones(4),
-        heave_mps=0.15,
-        heave_w=1.0,
-    )
+    turns = (TURN_IN_PLACE_RAD_S, SETTLE_S, STEP_MPS)
+    return Costs(speed_mps, np.ones(4), np.ones(4), 1.0, 0.0, *turns, np.ones(4), 0.15, 1.0)
 
 
 PAPER_COSTS = time_costs(0.2)  # Gutnik et al. 2021, section VII.A

@@ -69,6 +69,10 @@ def sections(held: Held, *, has_map: bool, has_mesh: bool) -> Iterator[Section]:
             f"{share(mesh.textured_share)} of it with texture. The files are in mesh/."
         )
         yield Section(name="mesh", title="Mesh", text=[text], scene="mesh")
+    planes = list(_planes(held))
+    if planes:
+        text = "plane.json next to the rasters of a plane says where a pixel lies in space."
+        yield Section(name="planes", title="Planes", text=[text], figures=planes)
     if score is not None:
         yield _truth(score, held)
     if held.file(ReferenceRecord.path) or held.earlier:
@@ -77,18 +81,14 @@ def sections(held: Held, *, has_map: bool, has_mesh: bool) -> Iterator[Section]:
         yield _control(control)
     if held.has("dense"):
         yield _surface(held)
-    planes = list(_planes(held))
-    if planes:
-        text = "plane.json next to the rasters of a plane says where a pixel lies in space."
-        yield Section(name="planes", title="Planes", text=[text], figures=planes)
     if held.registration is not None:
         yield _model(held, held.registration)
-    if held.has("mapping") or held.has("calibration"):
-        yield _camera(held)
     if held.rows("quality/quality.csv"):
         about = "Sharpness, contrast, brightness and veil of each picture along the survey."
         still = _stills(held, ("quality/quality.png", "Quality of the pictures", about))
         yield Section(name="quality", title="Quality of the pictures", figures=still)
+    if held.has("mapping") or held.has("calibration"):
+        yield _camera(held)
     if plan is not None and held.has("dense"):
         yield _mission(held, plan)
     yield _reproduce(held)
