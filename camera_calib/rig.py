@@ -96,6 +96,9 @@ class Rig:
         if not self.cameras or set(self.cameras) != set(self.cam_from_rig):
             raise CalibrationError("rig: every camera needs one pose and every pose a camera")
 
+    def __repr__(self) -> str:
+        return f"rig: {', '.join(self.cameras)} ({self.source})"
+
     @property
     def sigmas(self) -> dict[str, float]:
         """Standard deviations of calibrated parameters by name, such as `left.fx_px`."""

@@ -363,7 +363,7 @@ class VehicleConfig(Config):
     """Whether the vehicle watches how its thrusters turn, and what they push."""
 
     name: str = setting(
-        DEFAULT_VEHICLE, "alice (five thrusters), sparus2 (three), or the TOML file of another",
+        DEFAULT_VEHICLE, "alice, sparus2, bluerov2_heavy, remus100, or a TOML file from here",
         min_length=1,
     )  # fmt: skip
     coefficients: str = setting(

@@ -279,8 +279,9 @@ def _cola2(export: Export, files: Iterable[Path], *, chosen: bool) -> list[str]:
     if exceeds and (chosen or not follower.sways):
         towards_deg = math.degrees(math.atan2(*follower.current_ne_mps[::-1])) % 180.0
         along = f"lay lines along the current (line_heading_deg = {towards_deg:.0f})"
-        calmer = f"{along}, wait for less of it, or " if follower.current_mps else ""
-        warn(f"{expected}: {calmer}fly another autopilot's mission")
+        ways = [along, "wait for less of it"] if follower.current_mps else []
+        ways += ["fly another autopilot's mission"] if follower.sways else []
+        warn(f"{expected}: {', or '.join(ways)}" if ways else expected)
     elif chosen or not follower.sways:
         note(expected)
     return [
@@ -290,8 +291,9 @@ def _cola2(export: Export, files: Iterable[Path], *, chosen: bool) -> list[str]:
         f"  section/min_surge_velocity {own.min_surge_mps:g} m/s",
         f"  section/max_surge_velocity {own.max_surge_mps:g} m/s",
         f"{expected[0].upper()}{expected[1:]}.",
-        f"In turns it leaves the allowed area by up to {outside_m:.2f} m (area.turn_margin_m).",
-    ]
+        *([f"In turns it leaves the allowed area by up to {outside_m:.2f} m (area.turn_margin_m)."]
+          if outside_m >= 0.005 else []),
+    ]  # fmt: skip
 
 
 def _ardusub(export: Export) -> list[str]:

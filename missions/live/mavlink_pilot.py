@@ -286,7 +286,8 @@ def mavlink_to(address: str, **settings: int) -> Any:
         raise VehicleError(f"pymavlink is not installed: {extra('mavlink')}") from None
     try:
         return mavutil.mavlink_connection(address, dialect="ardupilotmega", **settings)
-    except (OSError, ValueError, IndexError) as error:
+    except (ImportError, OSError, ValueError, IndexError) as error:
         raise VehicleError(
-            f"{address}: cannot be opened ({error}): give one as udpin:127.0.0.1:14550"
+            f"{address}: cannot be opened ({error}): give one as udpin:127.0.0.1:14550, or install "
+            "pyserial for a serial port"
         ) from None

@@ -30,6 +30,7 @@ from alice_survey.core.contents import read_arrays
 from alice_survey.core.errors import ReconstructionError
 from alice_survey.core.frames import Array
 from alice_survey.core.records import MappingRecord, RegistrationRecord, ScaleRecord
+from alice_survey.kit.words import digits, with_sigma
 from camera_calib.rig import Rig, read_rig
 from reconstruct.adjustment.exact_observations import (
     PixelParts,
@@ -606,10 +607,11 @@ def _describe(
     segments, lines = [], []
     for (one, other), figure in zip(pairwise(words), figures, strict=False):
         segments.append({"from": one, "to": other, **entry(figure, "m")})
+        sigmas = (figure.sigma_picks, figure.sigma_poses, figure.sigma_scale)
+        picks, poses, scale = (digits(1e3 * sigma, 2) for sigma in sigmas)
         lines.append(
-            f"{one} to {other}: {_millimetres(figure)} ({1e3 * figure.sigma_picks:.2f} of pixels, "
-            f"{1e3 * figure.sigma_poses:.2f} of poses, {1e3 * figure.sigma_scale:.2f} of "
-            "calibration)"
+            f"{one} to {other}: {_millimetres(figure)} ({picks} of pixels, {poses} of poses, "
+            f"{scale} of calibration)"
         )
     data: dict[str, Any] = {
         "format": "alice-survey measure",
@@ -624,11 +626,9 @@ def _describe(
         length, area = figures[-2:]
         data["length"], data["area"] = entry(length, "m"), entry(area, "m2")
         lines.append(f"length of the line: {_millimetres(length)}")
-        lines.append(
-            f"area of the polygon: {1e4 * area.value:.3f} cm2, sigma {1e4 * area.sigma:.3f} cm2"
-        )
+        lines.append(f"area of the polygon: {with_sigma(1e4 * area.value, 1e4 * area.sigma)} cm2")
     return "\n".join(lines), data
 
 
 def _millimetres(length: PickedFigure) -> str:
-    return f"{1e3 * length.value:.2f} mm, sigma {1e3 * length.sigma:.2f} mm"
+    return f"{with_sigma(1e3 * length.value, 1e3 * length.sigma)} mm"

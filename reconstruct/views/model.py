@@ -12,6 +12,7 @@ from scipy.spatial.transform import RigidTransform
 from alice_survey.core.contents import in_workspace, taken_from
 from alice_survey.core.frames import Array, Datum
 from alice_survey.core.records import CamerasRecord, FrameRecord, PlaceRecord
+from alice_survey.kit.words import count
 from camera_calib.approximation.pinhole_warp import Pinhole, PinholeWarp, warp_from_json
 from reconstruct.views.range_shift import KernelLens, RangeShift, carry, no_shift, range_shift
 
@@ -73,6 +74,9 @@ class View:
     shift: RangeShift
     """What the warp of the picture leaves of the port's refraction."""
 
+    def __repr__(self) -> str:
+        return f"view: {self.image}, station {self.station}"
+
     def project(self, points_world: Array) -> Array:
         """Pixels (N, 2) at which the warped picture shows points (N, 3); NaN behind the camera."""
         points = self.world_from_cam.inv().apply(points_world)
@@ -117,6 +121,10 @@ class SparseModel:
     """(P, 3) points in the world."""
     observations: NDArray[np.int64]
     """(O, 2) rows of point index and view index."""
+
+    def __repr__(self) -> str:
+        views, points = count(len(self.views), "view"), count(len(self.points_world), "point")
+        return f"model: {views}, {points} in the frame '{self.frame.name}'"
 
 
 def write_frame(path: Path, frame: WorldFrame) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from alice_survey.app.api.arrays import Dem, Mosaic, Track, read_dem, read_mosaic, read_track
+from alice_survey.core.artefacts import need_stage
 from alice_survey.core.config import SurveyConfig
 from alice_survey.core.contents import first_fault
 from alice_survey.core.errors import ConfigError, file_faults
@@ -149,7 +150,10 @@ class Survey:
         return run(stages or names(), self.folder, None, executor=local_executor(threads))[1]
 
     def plan(self) -> Plan:
-        """Plan the survey if its plan is missing or stale, and return the plan."""
+        """Plan the survey if its plan is missing or stale, and return the plan.
+
+        A new plan makes later stages stale; `read_plan` only reads one.
+        """
         self.run("plan")
         return read_plan(self.folder / "plan" / "plan.json")
 
@@ -170,22 +174,22 @@ class Survey:
     @property
     def model(self) -> SparseModel:
         """Registered views and points."""
-        return read_model(self.folder / "sparse")
+        return read_model(need_stage(self.folder, "sparse", "reconstruct"))
 
     @property
     def track(self) -> Track:
         """Positions of the pictures, with covariances."""
-        return read_track(self.folder)
+        return read_track(need_stage(self.folder, "sparse", "reconstruct"))
 
     @property
     def dem(self) -> Dem:
         """Heights of the surface with their sigmas, at most 4,000 cells a side."""
-        return read_dem(self.folder)
+        return read_dem(need_stage(self.folder, "dense", "reconstruct") / "dem.tif")
 
     @property
     def mosaic(self) -> Mosaic:
         """The orthomosaic, at most 4,000 pixels a side."""
-        return read_mosaic(self.folder)
+        return read_mosaic(need_stage(self.folder, "mosaic", "reconstruct") / "mosaic.tif")
 
     def _repr_html_(self) -> str:
         rows = "".join(

@@ -37,6 +37,7 @@ class InitCommand(WorkspaceCommand):
     def run(self) -> None:
         """Write it."""
         from alice_survey.app.pipeline import init_survey
+        from alice_survey.core.stages import is_imported
 
         template = f"{self.example or 'survey'}.toml"
         try:
@@ -45,7 +46,8 @@ class InitCommand(WorkspaceCommand):
             raise PlanError(
                 f"{fault}; {offer('init', self.workspace)!r} begins without it"
             ) from None
-        typer.echo(f"wrote {path}; next: {offer('plan', '-w', self.workspace)}")
+        following = "reconstruct" if is_imported(self.workspace) else "plan"
+        typer.echo(f"wrote {path}; next: {offer(following, '-w', self.workspace)}")
 
 
 class FovCommand(ReportCommand):
@@ -81,7 +83,7 @@ class FovCommand(ReportCommand):
         "-s", "--survey", metavar="FILE",
     )  # fmt: skip
     validates: bool = option(
-        False, "Check the paper's optics; exit with 1 if one is wrong.", "--validate"
+        False, "Check the paper's optics; exit with 3 if one is wrong.", "--validate"
     )
     plot: Path | None = option(None, "Draw the curves: .png, .svg or .pdf.", metavar="FILE")
     csv: Path | None = option(None, "Write the rows to a CSV file.", metavar="FILE")
