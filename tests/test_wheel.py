@@ -46,7 +46,6 @@ ALLOWED = {
     "solve.bilinear.entry": 2,
     "visibility.look_up": 2,
     # Literals, places left out, and two widths of numbers.
-    "points._way": 2,
     "range_shift.slopes_of": 2,
     "surface_points.sorted_ranks": 2,
 }
