@@ -18,7 +18,7 @@ def test_the_command_line_takes_what_is_written(name: str, tmp_path: Path) -> No
     folder.mkdir()
     examples: dict[str, Any] = {
         "folders": [str(folder)], "camera": [f"bow={folder}", f"port={folder}"],
-        "video": [str(folder)], "threads": 2, "scale": 4, "points": "-1,0,0 1,0,0", "length": 0.5,
+        "video": [str(folder)], "threads": 2, "scale": 4, "points": ["-1,0,0 1,0,0"], "length": 0.5,
         "plane": ["level", "wall=facing 180"], "crs": "EPSG:32636", "export": "undistorted",
         "vehicle": "alice", "controller": "sway", "dive": 1, "overlap": 0.7, "every": 2.0,
         "recursive": True, "clock_offset": -1.5, "time_zone": "Europe/Oslo",
