@@ -30,13 +30,13 @@ PACKAGES = ("alice_survey", "camera_calib", "missions", "reconstruct")
 WORDS = Path(__file__).with_name("structure_words.toml")
 """Words that are not used, and where each of them counts."""
 BOUNDS = {
-    "code lines of the packages": 71_426,  # 69,438, and a part of the reserve of 2,000
-    "code lines of the tests": 51_491,  # 48,310, and a part of the reserve of 4,000
-    "code lines of the benchmarks": 7_985,
+    "code lines of the packages": 71_422,  # 69,438, and a part of the reserve of 2,000
+    "code lines of the tests": 51_634,  # 48,310, and a part of the reserve of 4,000
+    "code lines of the benchmarks": 7_973,
     "lines of our own JavaScript": 4_900,
     "modules": 393,
     "modules with a single importer": 70,
-    "kernels": 241,
+    "kernels": 238,
     "commands": 36,
     "options of commands": 350,
     "settings": 125,

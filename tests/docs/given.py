@@ -169,6 +169,7 @@ def _robots(folder: Path, made: Made) -> None:
 
 def _colour_camera(folder: Path, made: Made) -> None:
     _bring(folder, made.dive, made.reef / "calibration/rig.json")
+    _few_features(folder / "dive", "water")
     shutil.copytree(made.reef / "images/left", folder / "pictures")
 
 
