@@ -167,8 +167,8 @@ def aquarium(shared_data: Path) -> Aquarium:
 
 @pytest.fixture(scope="module")
 def tank(aquarium: Aquarium) -> Tank:
-    """Refined on every sixteenth detection."""
-    return aquarium.refined(np.arange(0, aquarium.pixels.shape[1], 16))
+    """Refined on every eighth detection."""
+    return aquarium.refined(np.arange(0, aquarium.pixels.shape[1], 8))
 
 
 def test_cameras_stand_above_and_before_the_tank(tank: Tank) -> None:
@@ -179,7 +179,7 @@ def test_cameras_stand_above_and_before_the_tank(tank: Tank) -> None:
 
 
 def test_reprojection_error_is_below_the_published(aquarium: Aquarium, tank: Tank) -> None:
-    held_out = np.arange(aquarium.pixels.shape[1]) % 16 != 0
+    held_out = np.arange(aquarium.pixels.shape[1]) % 8 != 0
 
     found = tank.triangulate(aquarium.pixels[:, held_out])
 

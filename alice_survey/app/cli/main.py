@@ -23,7 +23,7 @@ CONTEXT = {"help_option_names": ["-h", "--help"]}
 _SHARED = ("workspace", "survey", "threads", "scheduler", "cluster", "device", "as_json", "quiet",
            "log_file")  # fmt: skip
 """Fields that come last in the help."""
-_ADVANCED = _SHARED[2:6] + _SHARED[7:]
+_ADVANCED = tuple(name for name in _SHARED if name not in ("workspace", "survey", "as_json"))
 """Of these, and of a command's `advanced`, the help tells under a heading of their own."""
 _VEHICLE = "The vehicle: coefficients from geometry and from logs, and how its two forms compare."
 """Help of the group of commands that is no command itself."""

@@ -149,7 +149,7 @@ class WorkspaceCommand(CommandModel):
     @classmethod
     def _no_file(cls, workspace: Path) -> Path:
         if workspace.exists() and not workspace.is_dir():
-            raise ValueError(f"{workspace} is a file, no folder (films: import-images --video)")
+            raise ValueError(f"{workspace} is a file, no folder (videos: import-images --video)")
         return workspace
 
     def show_next(self, found: object, folder: Path) -> None:

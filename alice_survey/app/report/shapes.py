@@ -53,9 +53,9 @@ def shape_layers(held: Held) -> Iterator[ShapeLayer]:
                colour=_ORANGE, shown=not held.has("mosaic")),
         _layer("cameras", "Cameras", "Where pictures were taken, from the model.", "point",
                _cameras(held), colour=_BLUE, shown=not track and not held.has("mosaic")),
-        _layer("lost", "Lost pictures" if held.has("sparse") else "Pictures",
+        _layer("unplaced", "Lost pictures" if held.has("sparse") else "Pictures",
                "Pictures that are not in a model, where navigation has them.", "point",
-               _lost_pictures(held), colour=_RED if held.has("sparse") else _BLUE),
+               _unplaced_pictures(held), colour=_RED if held.has("sparse") else _BLUE),
     )  # fmt: skip
     yield from (layer for layer in made if layer.shapes)
 
@@ -103,7 +103,7 @@ def _cameras(held: Held) -> list[tuple[Shape, str]]:
     return found
 
 
-def _lost_pictures(held: Held) -> list[tuple[Shape, str]]:
+def _unplaced_pictures(held: Held) -> list[tuple[Shape, str]]:
     datum = held.frame.datum
     if datum is None:
         return []
