@@ -360,7 +360,6 @@ class FollowedDive:
                 "source": str(self.log), "fault": self.fault, "version": self.version, "fix": None,
                 "silent_s": age_s, "patience_s": self._patience_s,
                 "is_silent": age_s is not None and age_s > self._patience_s,
-                "planned_altitude_m": self.plan.altitude_m,
                 "bounds": self._frame[1],
                 "proposal": self._proposal_json(),
             }  # fmt: skip

@@ -83,7 +83,7 @@ class StudioCommand(WorkspaceCommand):
         from alice_survey.app.studio.server import run_studio
 
         if self.background is not None:
-            note("--background: web maps are no longer shown under a survey")
+            note("--background: a base map is chosen in the page, under Layers")
         run_studio(self.workspace, self.port, browser=self.browser, show=typer.echo, log=self.log)
 
 

@@ -80,7 +80,8 @@ _KEEP = "private, max-age=86400, immutable"
 _BODY_S = 30.0
 """Time for the body of a request to arrive."""
 _STUDIO_POLICY = (
-    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; "
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob: "
+    "https: http://127.0.0.1:* http://localhost:*; "
     "connect-src 'self'; base-uri 'none'; form-action 'none'"
 )
 """Policy of the studio's page."""

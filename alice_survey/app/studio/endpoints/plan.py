@@ -181,10 +181,6 @@ class _PlanTab:
         shapes = drawing.shapes.model_dump(mode="json")
         return {**shapes, "datum": _datum(drawing.datum), "warnings": texts}
 
-    def text(self, call: Call) -> dict[str, Any]:
-        """The settings file as it would be saved."""
-        return {"survey_toml": self.draft(call.read(PlanRequest)).text}
-
     def save(self, call: Call) -> Content:
         """Write the settings, and plan as the command line does."""
         request = call.read(PlanRequest)
@@ -267,6 +263,5 @@ def endpoints(studio: Studio) -> Sequence[Endpoint]:
         Endpoint(path="/api/plan/export", answer=plan.export),
         post("preview", plan.preview, computes=True),
         post("import", plan.read_dropped, max_bytes=_MAX_FILE),
-        post("text", plan.text),
         post("save", plan.save, writes=True),
     )

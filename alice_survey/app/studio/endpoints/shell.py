@@ -34,11 +34,13 @@ class _Shell:
         workspace = self.studio.workspace
         held = Held.of(workspace.folder)
         found = survey_map(held, ())
+        datum = held.frame.datum if found.axes == EAST_NORTH else None
         is_model = found.axes != EAST_NORTH and held.has("sparse")
         return {
             "workspace": str(workspace.folder),
             "name": held.name,
             "stages": sorted(held.stages),
+            "datum": datum and [datum.latitude_deg, datum.longitude_deg],
             "unit": found.unit,
             "axes": found.axes if is_model else EAST_NORTH,
             "has": {name: workspace.has(path) for name, path in _PRODUCTS.items()},

@@ -3,12 +3,10 @@
 
 import {attempt, button, el, field, get, missing, on, say, send, table} from "./core.js";
 import {BLUE, GREEN, GREY, INK, ORANGE, PINK, RED, SKY} from "./palette.js";
-import {profileChart} from "./profile_chart.js";
 import {clock, counted, number, share} from "./words.js";
 
 const LEGEND = [[GREEN, "at the requested overlap"], [SKY, "in stereo"], [ORANGE, "in a picture"],
   ["#3c3c3c3c", "not yet"]];  /* as the coverage's own */
-const PROFILE_S = 300;
 const KEPT = 6000;
 
 export function tab(studio) {
@@ -45,7 +43,6 @@ export function tab(studio) {
     box.classList.toggle("bad", bad);
   };
 
-  const profile = el("div", {});
   const holeTable = el("div", {});
   const proposalText = el("p", {}, "");
   const format = el("select", {});
@@ -66,7 +63,6 @@ export function tab(studio) {
     el("ul", {class: "legend-row", "aria-label": "Colours of the coverage"},
       LEGEND.map(([colour, text]) => el("li", {},
       el("span", {class: "swatch", style: {background: colour}}), text))),
-    el("h3", {}, "Altitude against the plan"), profile,
     el("h3", {}, "A plan over the holes"), proposalText,
     field("Format", format),
     el("div", {class: "buttons"}, fetchIt),
@@ -268,7 +264,6 @@ export function tab(studio) {
   function showTrack() {
     shapes("follow-track", "line", "Track", INK, [fixes.map((fix) => [fix[2], fix[1]])],
       {width: 1.6});
-    showProfile();
     const [, n, e] = fixes.at(-1);
     shapes("follow-vehicle", "point", "Vehicle", BLUE, [[[e, n]]]);
     if (centred) return;
@@ -302,24 +297,6 @@ export function tab(studio) {
       proposalText.textContent = state.holes.count
         ? "No lines can reach the holes." : "No holes so far: nothing to close.";
     }
-  }
-
-  /* ---- Altitude ---- */
-
-  function showProfile() {
-    const last = fixes[fixes.length - 1][0];
-    const shown = fixes.filter((fix) => fix[0] > last - PROFILE_S && fix[3] !== null);
-    const plan = state.planned_altitude_m;
-    const minutes = (fix) => (fix[0] - last) / 60;
-    const latest = shown.length ? shown[shown.length - 1][3] : null;
-    profile.replaceChildren(profileChart(
-      `Altitude over the last five minutes: now ${number(latest, "m")}, planned ${
-        number(plan, "m")}`, {
-        lines: [{kind: "planned", xs: [-PROFILE_S / 60, 0], ys: [plan, plan]},
-          {kind: "flown", xs: shown.map(minutes),
-            ys: shown.map((fix) => Math.min(fix[3], 2 * plan))}],
-        range: [0, 2 * plan], caption: "minutes from now; altitude, m", high: 120,
-      }));
   }
 
   return {

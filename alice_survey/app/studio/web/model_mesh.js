@@ -1,7 +1,7 @@
 /* The mesh in 3D in the tab Model: it turns, a click picks a place on it, two picks give a
    length. */
 
-import {attempt, button, bytes, el, field, get, say} from "./core.js";
+import {attempt, button, bytes, el, get, say} from "./core.js";
 import {startTiles} from "./model_tiles.js";
 import {WHITE} from "./palette.js";
 import {counted, number} from "./words.js";
@@ -56,12 +56,8 @@ export function meshPart(studio, {colour, measured}) {
   const large = button("Larger, over the map", () => enlarge(
     large.getAttribute("aria-pressed") !== "true"), {"aria-pressed": "false"});
   const about = el("p", {class: "note"});
-  const kinds = el("select");
-  const choice = field("Drawn as", kinds);
-  choice.hidden = true;
   const streamed = el("p", {class: "note"});
-  const body = el("div", {}, choice, el("div", {class: "buttons"}, large), home, streamed, picked,
-    about);
+  const body = el("div", {}, el("div", {class: "buttons"}, large), home, streamed, picked, about);
   home.append(root);
   const element = el("details", {hidden: true}, el("summary", {}, "In 3D"), body);
   const spots = leaflet.featureGroup();
@@ -69,41 +65,17 @@ export function meshPart(studio, {colour, measured}) {
   let lies = null;
   let begun = false;
   let picks = [];
-  let drawn = null;
-  const started = {};
 
-  const heard = (words) => ({
+  /* Tiles in full detail in place of the light copy. */
+  const refine = async () => scene.show(await startTiles(scene, lies.tiles, {
     progress({parts, coming, bytes: held}) {
       Object.assign(canvas.dataset, {parts: parts.length, coming,
         mib: (held / 2 ** 20).toFixed(3)});
-      streamed.textContent = words(parts) + " drawn, " + coming + " on the way, " + number(
-        held / 2 ** 20, "MB", 2) + " held";
+      streamed.textContent = counted(parts.length, "tile") + " drawn, " + coming
+        + " on the way, " + number(held / 2 ** 20, "MB", 2) + " held";
     },
     failed: (fault) => say("A part is not drawn: " + fault.message, "error"),
-  });
-
-  const starts = {
-    light: () => null,
-    tiles: () => startTiles(scene, lies.tiles, heard((parts) => counted(parts.length, "tile"))),
-  };
-
-  async function draw() {
-    const kind = kinds.value;
-    drop();
-    try {
-      started[kind] = started[kind] || starts[kind]();
-      const next = await started[kind];
-      if (kind !== kinds.value) return;
-      drawn?.detail?.clear();
-      drawn = {kind, detail: next};
-      streamed.textContent = "";
-      scene.show(next);
-    } catch (fault) {
-      delete started[kind];
-      kinds.value = drawn?.kind || "";
-      throw fault;
-    }
-  }
+  }));
 
   function enlarge(on) {
     large.setAttribute("aria-pressed", String(on));
@@ -160,24 +132,18 @@ export function meshPart(studio, {colour, measured}) {
       told: (text) => { told.textContent = text; },
       lost: () => still("The browser took its graphics memory back"),
     });
-    const choices = [["light", "Mesh, light copy"], ["tiles", "Mesh, full detail (3D Tiles)"]];
-    choices.slice(0, lies.tiles ? 2 : 1).forEach(([value, text]) =>
-      kinds.append(el("option", {value}, text)));
-    choice.hidden = kinds.length < 2;
     root.dataset.ready = "";
-    await draw();
+    if (lies.tiles) await refine();
   }
 
   function still(why) {
     root.hidden = true;
     large.hidden = true;
-    choice.hidden = true;
     picked.textContent = why + (lies.still ? ": this is a still picture." : ".");
     if (lies.still) home.append(
       el("img", {src: lies.still, alt: "The mesh seen from above and from the side"}));
   }
 
-  kinds.addEventListener("change", () => attempt(draw));
   let down = null;
   canvas.addEventListener("pointerdown", (event) => { down = [event.clientX, event.clientY]; });
   canvas.addEventListener("pointerup", (event) => {

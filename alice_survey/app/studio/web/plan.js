@@ -39,8 +39,7 @@ export function tab(studio) {
   let settings = null;
 
   const content = el("div", {hidden: true},
-    el("div", {class: "plan-top"}, el("div", {class: "buttons"}, back, forth, keep,
-      button("Text", showText, {title: "Show survey.toml as it would be saved"})),
+    el("div", {class: "plan-top"}, el("div", {class: "buttons"}, back, forth, keep),
       results.key, note),
     results.top,
     el("h2", {}, "Area"), draw.panel,
@@ -67,9 +66,15 @@ export function tab(studio) {
     },
   });
 
+  function lay(state) {
+    draw.update(shapesOf(state));
+    const {latitude_deg, longitude_deg} = {...file.datum, ...state.changes.area};
+    studio.datumIs([latitude_deg, longitude_deg]);
+  }
+
   function plan(state, wait) {
     clearTimeout(quiet);
-    draw.update(shapesOf(state));
+    lay(state);
     if (hasArea(state)) planning.request(state, wait);
     else planning.stop();
   }
@@ -144,7 +149,7 @@ export function tab(studio) {
     if (!same(state, AS_IN_FILE)) history = record(history, state);
     buttons();
     settings.set(body().changes, file.saved);
-    draw.update(shapesOf(body()));
+    lay(body());
     if (isDirty() || !file.saved) plan(body(), 0);
     else settled(file.saved);
     if (file.error) say(file.error, "error");
@@ -179,33 +184,18 @@ export function tab(studio) {
     else attempt(() => restart());
   });
 
-  function dialog(title, ...children) {
-    const box = el("dialog", {"aria-label": title, onclose: () => box.remove()},
-      el("h2", {}, title), ...children);
-    document.body.append(box);
-    box.showModal();
-    return box;
-  }
-
   function conflict(fault) {
     const mine = body();
-    const box = dialog("Changed by somebody else",
-      el("p", {}, fault.message),
+    const title = "Changed by somebody else";
+    const box = el("dialog", {"aria-label": title, onclose: () => box.remove()},
+      el("h2", {}, title), el("p", {}, fault.message),
       el("div", {class: "buttons"},
         button("Load theirs", () => { box.close(); attempt(() => restart()); }, {class: "primary"}),
         button("Keep mine on top of theirs", () => { box.close(); attempt(() => restart(mine)); }),
         button("Cancel", () => box.close())));
+    document.body.append(box);
+    box.showModal();
     say(fault.message, "warn");
-  }
-
-  function showText() {
-    return attempt(async () => {
-      const text = await send("/api/plan/text", {...body(), token: file.token});
-      const box = dialog("survey.toml, as Save writes it",
-        el("div", {class: "plan-text", tabindex: "0", role: "region",
-          "aria-label": "Text of survey.toml"}, text.survey_toml),
-        el("div", {class: "buttons"}, button("Close", () => box.close(), {class: "primary"})));
-    });
   }
 
   /* ---- Import ---- */

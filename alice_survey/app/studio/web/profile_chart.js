@@ -1,17 +1,16 @@
 /* A chart of values along a way or over time. */
 
-import {pathData, ticks} from "./chart_lines.js";
 import {el} from "./core.js";
+import {pathData, ticks} from "./words.js";
 
 const [WIDE, LEFT, RIGHT, ABOVE, BELOW] = [340, 46, 8, 8, 30];
 
 /* Lines are [{kind, xs, ys, sigmas, ground}]: `kind` is its class in studio.css, sigmas give it a
-   band, a ground is filled below it. `range` is of the values; `downwards` lets them grow
-   downwards, as depths do; `rules` are places that get an upright line. */
-export function profileChart(
-  label, {lines, range = rangeOf(lines), downwards = false, caption, rules = [], high = 150}) {
+   band, a ground is filled below it. `downwards` lets them grow downwards, as depths do; `rules`
+   are places that get an upright line. */
+export function profileChart(label, {lines, downwards = false, caption, rules = [], high = 150}) {
   const [start, end] = [lines[0].xs[0], lines[0].xs.at(-1)];
-  const [low, most] = range;
+  const [low, most] = rangeOf(lines);
   const base = high - BELOW;
   const x = (value) => LEFT + (value - start) / (end - start || 1) * (WIDE - LEFT - RIGHT);
   const y = (value) => (Number.isFinite(value) ? ABOVE + (base - ABOVE)

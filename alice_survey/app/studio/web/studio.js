@@ -1,5 +1,6 @@
 /* The studio's shell: the one map, its list of layers, and the tabs. */
 
+import {baseMap} from "./base_map.js";
 import {attempt, el, get, mayWrite, say} from "./core.js";
 
 const state = await attempt(() => get("/api/state"));
@@ -19,6 +20,9 @@ const core = startMap(mapData, document.getElementById("map"));
 /* ---- The map with its list of layers ---- */
 
 const list = document.getElementById("layer-list");
+const under = baseMap(core.leaflet);
+list.after(el("div", {}, under.control));
+under.at(state.datum);
 
 function legendOf(about) {
   const {scale} = about;
@@ -104,7 +108,7 @@ core.fit(false);
 
 /* ---- Tabs ---- */
 
-const studio = {map, state, open, refresh, mayWrite};
+const studio = {map, state, open, refresh, mayWrite, datumIs: under.at};
 const tabs = new Map();
 const bar = document.getElementById("tabs");
 const panel = document.getElementById("panel");
@@ -113,6 +117,7 @@ let current = null;
 /* Read the state anew, after a stage was made. */
 async function refresh() {
   Object.assign(state, await get("/api/state"));
+  under.at(state.datum);
   const now = await get("/api/map");
   mapData.extent = now.extent;
   core.extend(now.extent);

@@ -27,8 +27,6 @@ export const redo = (history) =>
 /* Equal as JSON values, whatever the order of keys. */
 export function same(a, b) {
   if (a === b) return true;
-  if (a instanceof Map && b instanceof Map) return a.size === b.size
-    && [...a].every(([key, value]) => same(value, b.get(key)));
   if (typeof a !== "object" || typeof b !== "object" || a === null || b === null) return false;
   const [keys, others] = [Object.keys(a), Object.keys(b)];
   return Array.isArray(a) === Array.isArray(b) && keys.length === others.length

@@ -212,7 +212,7 @@ def test_unknown_values_interrupt_a_line_and_ticks_are_round_and_within_limits(
 ) -> None:
     limits = [(-12.31, -11.87, 5), (0.0, 1234.0, 5), (0.0, 4.0, 4), (-5.0, 0.0, 5)]
     path, found = run(
-        tmp_path, "chart_lines",
+        tmp_path, "words",
         "[m.pathData([0, 1, 2, 3, 4], [1, 2, null, 3, 4]), l.map((row) => m.ticks(...row))]",
         l=limits,
     )  # fmt: skip
