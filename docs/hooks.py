@@ -31,10 +31,6 @@ _BAR = re.compile(r'<mo(?: stretchy="false")?>(&#x02016;|&#x0007C;)</mo>')
 _TABLE = re.compile(r"<!-- ([\w ]+): made when the site is built -->")
 _OPTION_HEAD = ["| option | value | default | what |", "|---|---|---|---|"]
 _SETTING_HEAD = ["| setting | default | range | what |", "|---|---|---|---|"]
-_SHARED = {
-    "--workspace", "-w", "-s", "--survey", "--threads", "--scheduler", "--cluster", "--device",
-    "--json", "-q", "--quiet", "--log-file", "WORKSPACE",
-}  # fmt: skip
 _PARTS = re.compile(
     r'(<nav class="md-nav"[^>]*)aria-labelledby="__nav_\w+"'
     r"([^>]*>\s*<label[^>]*>\s*<span[^>]*></span>([^<]+)</label>)"
@@ -76,6 +72,7 @@ def made_table(name: str, where: str) -> str:
         "export formats": formats_table,
         "rasters": rasters_table,
         "commands": commands_table,
+        "exit codes": exit_codes_table,
         "settings": settings_tables,
     }
     if name.startswith("commands of "):
@@ -99,7 +96,7 @@ def commands_table() -> str:
     shared: dict[str, str] = {}
     for _, command in _found(" ".join(GROUPS.values())):
         for option in command.params:
-            if _name(option) in _SHARED:
+            if _is_shared(option):
                 shared.setdefault(_name(option), _option_row(option))
     return "\n".join([*lines, "## Options of many commands", *_OPTION_HEAD, *shared.values()])
 
@@ -113,10 +110,10 @@ def command_sections(heading: str) -> str:
         examples = command.epilog.split("Examples:\n")[-1]
         lines += [f"## `alice-survey {name}`", _plain(command.help.replace("\b\n", "")), ""]
         lines += ["```text", *(line.strip() for line in examples.strip().splitlines()), "```", ""]
-        own = [one for one in command.params if _name(one) not in _SHARED]
+        own = [one for one in command.params if not _is_shared(one)]
         if own:
             lines += [*_OPTION_HEAD, *map(_option_row, own), ""]
-        if shared := [f"`{_name(one)}`" for one in command.params if _name(one) in _SHARED]:
+        if shared := [f"`{_name(one)}`" for one in command.params if _is_shared(one)]:
             lines += [f"Also {', '.join(shared)} ([options of many commands](index.md)).", ""]
     return "\n".join(lines)
 
@@ -139,6 +136,13 @@ def _found(names: str) -> Iterator[tuple[str, Any]]:
 def _name(option: Any) -> str:
     """An option's long name, an argument's own."""
     return str(option.opts[0] if option.param_type_name == "option" else option.metavar)
+
+
+def _is_shared(option: Any) -> bool:
+    """Whether many commands have it; `folder` is the workspace as an argument."""
+    from alice_survey.app.cli.main import SHARED
+
+    return option.name in (*SHARED, "folder")
 
 
 def _option_row(option: Any) -> str:
@@ -200,6 +204,20 @@ def _setting_row(name: str, field: Any) -> str:
         bounds = [(sign, getattr(one, key, None)) for one in field.metadata for key, sign in signs]
         limits = ", ".join(f"{sign} {value:.10g}" for sign, value in bounds if value is not None)
     return f"| `{name}` | {shown} | {limits} | {_plain(field.description or '')} |"
+
+
+def exit_codes() -> dict[str, str]:
+    """What each exit code of the command line means."""
+    from alice_survey.app.cli.main import main
+
+    about = re.sub(r"\n {8}", " ", inspect.getdoc(main) or "")
+    return dict(re.findall(r"^    ([\d, ]+): (.*)$", about, re.M))
+
+
+def exit_codes_table() -> str:
+    """The exit codes as a table in Markdown."""
+    rows = [f"| {codes} | {meaning} |" for codes, meaning in exit_codes().items()]
+    return "\n".join(["| code | meaning |", "|---|---|", *rows])
 
 
 def formats_table() -> str:

@@ -13,6 +13,8 @@ import pytest
 import yaml
 
 import alice_survey as alice
+from alice_survey.app.studio.jobs import _CODES_OF_STOP
+from alice_survey.core.errors import NOT_GOOD_ENOUGH
 from tests import structure
 from tests.alice_survey.kit.browser import Heard, chromium, is_accessible
 from tests.docs.pages import DOCS, pages
@@ -78,6 +80,12 @@ def test_the_reference_has_every_command_option_and_setting(site: Path) -> None:
     for section, field in alice.SurveyConfig.model_fields.items():
         for key in getattr(field.annotation, "model_fields", {section: field}):
             assert f"<code>{key}</code>" in reference, f"{section}.{key}"
+
+
+def test_the_reference_has_every_exit_code(site: Path) -> None:
+    page = (site / "conventions.html").read_text(encoding="utf-8")
+    codes = re.findall(r"\d+", ",".join(re.findall(r"<td>([\d, ]+)</td>", page)))
+    assert sorted(map(int, codes)) == sorted((0, 1, 2, NOT_GOOD_ENOUGH, *_CODES_OF_STOP))
 
 
 def test_modules_that_the_theory_names_exist() -> None:

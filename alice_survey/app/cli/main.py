@@ -20,10 +20,10 @@ from alice_survey.core.contents import first_fault
 from alice_survey.core.errors import NOT_GOOD_ENOUGH, known_fault, note
 
 CONTEXT = {"help_option_names": ["-h", "--help"]}
-_SHARED = ("workspace", "survey", "threads", "scheduler", "cluster", "device", "as_json", "quiet",
-           "log_file")  # fmt: skip
+SHARED = ("workspace", "survey", "threads", "scheduler", "cluster", "device", "as_json", "quiet",
+          "log_file")  # fmt: skip
 """Fields that come last in the help."""
-_ADVANCED = tuple(name for name in _SHARED if name not in ("workspace", "survey", "as_json"))
+_ADVANCED = tuple(name for name in SHARED if name not in ("workspace", "survey", "as_json"))
 """Of these, and of a command's `advanced`, the help tells under a heading of their own."""
 _VEHICLE = "The vehicle: coefficients from geometry and from logs, and how its two forms compare."
 """Help of the group of commands that is no command itself."""
@@ -209,7 +209,7 @@ def _callback(kind: type[CommandModel], *, is_group: bool = False) -> Callable[.
 
     default = kind.model_fields["workspace"].default if has_folder else None
     fields = sorted(
-        kind.model_fields, key=lambda name: _SHARED.index(name) if name in _SHARED else -1
+        kind.model_fields, key=lambda name: SHARED.index(name) if name in SHARED else -1
     )
     parameters = [_parameter("context", typer.Context), *(_of_field(kind, name) for name in fields)]
     if has_folder:
@@ -287,7 +287,17 @@ def front_door(
 
 
 def main() -> None:
-    """Run the command line; a known fault is one line on standard error and exit code 1."""
+    """Run the command line; a known fault is one line on standard error.
+
+    Exit codes, as the documentation shows them:
+        0: done
+        1: a known fault, in one line; of the program itself a traceback
+        2: an option or argument that is none
+        3: done, and not good enough: a flight that ended early, a calibration with a `bad` verdict,
+            less than half of the pictures in the model, a check (`fov --validate`) that failed, a
+            mission of `pilot` that was not complete. `run` stops there unless `--accept` is given
+        129, 130, 143: hung up, Ctrl-C, SIGTERM: the same command goes on from there
+    """
     # Modules leave many objects that stay: looking through them again and again for garbage while
     # they are loaded takes a tenth of a command's start, and once more at its end half a second.
     gc.set_threshold(100_000)
