@@ -14,8 +14,9 @@ NOTEBOOKS = sorted((DOCS / "notebooks").glob("*.ipynb"))
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_a_notebook_runs(path: Path, tmp_path: Path, small_survey: Path) -> None:
-    shutil.copytree(small_survey, tmp_path / "small")
+def test_a_notebook_runs(path: Path, tmp_path: Path, request: pytest.FixtureRequest) -> None:
+    survey = "tiny" if path.stem == "compare" else "small"
+    shutil.copytree(request.getfixturevalue(f"{survey}_survey"), tmp_path / survey)
     notebook = nbformat.read(path, as_version=4)
     assert not any(cell.get("outputs") for cell in notebook.cells)  # none are stored
     client = NotebookClient(
