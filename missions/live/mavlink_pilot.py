@@ -274,20 +274,20 @@ def mavlink_to(address: str, **settings: int) -> Any:
     """Open a connection of pymavlink to ArduSub.
 
     Args:
-        address: of pymavlink, such as udpin:127.0.0.1:14550.
+        address: of pymavlink, such as udpin:127.0.0.1:14550 or /dev/ttyACM0,115200.
         settings: more of `mavutil.mavlink_connection`.
 
     Raises:
-        VehicleError: pymavlink is not installed, or the address cannot be opened.
+        VehicleError: pymavlink or pyserial is not installed, or the address cannot be opened.
     """
     try:
         from pymavlink import mavutil
-    except ImportError:
-        raise VehicleError(f"pymavlink is not installed: {extra('mavlink')}") from None
-    try:
+
         return mavutil.mavlink_connection(address, dialect="ardupilotmega", **settings)
-    except (ImportError, OSError, ValueError, IndexError) as error:
+    except ImportError as error:
+        raise VehicleError(f"{error.name} is not installed: {extra('mavlink')}") from None
+    except (OSError, ValueError, IndexError) as error:
         raise VehicleError(
-            f"{address}: cannot be opened ({error}): give one as udpin:127.0.0.1:14550, or install "
-            "pyserial for a serial port"
+            f"{address}: cannot be opened ({error}): give one as udpin:127.0.0.1:14550 or "
+            "/dev/ttyACM0,115200"
         ) from None

@@ -13,8 +13,9 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from alice_survey.core.artefacts import read_csv
 from alice_survey.core.config import SurveyConfig
+from alice_survey.core.errors import VehicleError
 from missions.fly.simulation import flight_settings
-from missions.live.mavlink_pilot import GUIDED, SURFACE, MavlinkPilot
+from missions.live.mavlink_pilot import GUIDED, SURFACE, MavlinkPilot, mavlink_to
 from missions.live.mission import LinkLimits, LinkState, mission_of
 from tests.missions.live.flights import FLOOR_M, pictures_of, small_plan, workspace_in
 
@@ -170,6 +171,14 @@ def test_what_is_not_of_now_is_not_flown_by(flying: Vehicle, spoilt: str) -> Non
     assert flying.mission.loop.state == LinkState.HELD
     last = flying.targets()[-1]
     assert (last.vx, last.vy, last.vz) == (0.0, 0.0, 0.0)
+
+
+def test_a_serial_port_without_its_library_names_what_to_install(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(sys.modules, "serial", None)
+    with pytest.raises(VehicleError, match=r"pip install .*pymavlink"):
+        mavlink_to("/dev/ttyACM0,115200")
 
 
 def test_vehicle_without_an_origin_is_given_the_datum() -> None:
