@@ -139,9 +139,15 @@ _DRAWS = {"matplotlib", "open3d", "pandas", "rosbags", "scipy.signal", "scipy.st
     ("command", "heavy"),
     [
         (["status"], _WORKS | _READS | _DRAWS | {"scipy"}),
-        (["plan"], _READS | _DRAWS | {"scipy.optimize", "scipy.interpolate"}),
-        (["fly"], _READS | _DRAWS),
-        (["studio", "--no-browser"], _DRAWS | {"scipy.optimize"}),
+        pytest.param(
+            ["plan"],
+            _READS | _DRAWS | {"scipy.optimize", "scipy.interpolate"},
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(["fly"], _READS | _DRAWS, marks=pytest.mark.slow),
+        pytest.param(
+            ["studio", "--no-browser"], _DRAWS | {"scipy.optimize"}, marks=pytest.mark.slow
+        ),
     ],
 )
 def test_a_result_is_printed_before_what_it_does_not_need_is_loaded(

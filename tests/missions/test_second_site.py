@@ -10,6 +10,7 @@ from missions.fly.simulation import floor_grid
 from tests.missions.flown_plans import flown, planned, terrain_of
 
 
+@pytest.mark.slow
 def test_the_site_of_the_paper_is_flown_over_its_rocks() -> None:
     """10 x 30 m at 8 m depth, flown at 3 m altitude (Gutnik et al. 2021, section VII)."""
     with resources.as_file(resources.files("alice_survey") / "caesarea.toml") as path:

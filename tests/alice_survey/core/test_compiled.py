@@ -110,6 +110,7 @@ def test_a_kernel_is_kept_when_files_change_that_it_does_not_use(folder: Path) -
     assert ask(folder) == (8.0, 1)
 
 
+@pytest.mark.slow
 def test_constants_and_code_of_a_called_kernel_count(folder: Path) -> None:
     write(folder, offset=10.0)
     assert ask(folder) == (26.0, 0)
@@ -263,6 +264,7 @@ def test_a_kernel_cannot_allocate() -> None:
         kernel(allocates)(1.0)
 
 
+@pytest.mark.slow
 def test_kernels_leave_numpys_library_alone() -> None:
     """numba compiles solvers, sorts and differences again for each kernel that calls them."""
     slow = re.compile(r"np\.(linalg\.\w+|diff|unique|argsort|sort|flatnonzero|take)$")

@@ -314,6 +314,7 @@ def test_swapped_lists_are_reported_first(dry: Path, tmp_path: Path) -> None:
         assert (text.splitlines()[0] == f"bad: {first['text']}") == is_bad
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick")
 def test_pictures_of_other_moments_are_no_calibration(dry: Path, tmp_path: Path) -> None:
     """No rig explains them: that shows before anything is adjusted."""

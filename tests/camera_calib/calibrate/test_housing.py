@@ -57,7 +57,13 @@ def calibrated(options: CalibrateOptions, found: Detections) -> Calibration:
     return calibrate_task(task_of(options, places, TARGET, dry()), found)
 
 
-@pytest.mark.parametrize(("port", "kind"), [(FLAT, "flat"), (CENTRED, "none"), (OFF, "dome")])
+@pytest.mark.parametrize(
+    ("port", "kind"),
+    [
+        *(pytest.param(*p, marks=pytest.mark.slow) for p in ((FLAT, "flat"), (CENTRED, "none"))),
+        (OFF, "dome"),
+    ],
+)
 def test_the_housing_is_found(port: PortValues, kind: str) -> None:
     found = calibrated(CalibrateOptions(water=True, port="auto", glass_mm="6"), through(port))
     assert {camera.port.shape for camera in found.rig.cameras.values()} == {kind}

@@ -57,6 +57,7 @@ def test_every_fifth_view_is_held_out_and_posed_without_it() -> None:
         assert np.abs(off).max() < 0.02
 
 
+@pytest.mark.slow
 def test_held_out_views_fit_as_noise_and_covariance_promise() -> None:
     """Squares of the errors over five calibrations, against their expectation."""
     scores = [score_hold_out(usual_held_out(seed)) for seed in range(1, 6)]

@@ -139,7 +139,7 @@ def test_a_chessboard_of_which_a_side_is_hidden_is_refused_and_what_is_seen_said
     assert named in str(detect(target, picture).refused)
 
 
-@pytest.mark.parametrize("turn", [(30, 20, 10), (0, 0, 90)])
+@pytest.mark.parametrize("turn", [(30, 20, 10), pytest.param((0, 0, 90), marks=pytest.mark.slow)])
 def test_a_board_of_another_size_is_refused_and_its_size_said(
     turn: tuple[float, float, float],
 ) -> None:
@@ -212,7 +212,9 @@ def test_numbering_follows_the_board_not_the_picture(text: str, turn: int) -> No
 
 @pytest.mark.parametrize("text", ["chessboard 8x6 25mm", "chessboard 7x5 25mm"])
 @pytest.mark.parametrize("invert", [False, True])
-@pytest.mark.parametrize("spin", [-60, 0, 60, 120])
+@pytest.mark.parametrize(
+    "spin", [-60, *(pytest.param(s, marks=pytest.mark.slow) for s in (0, 60, 120))]
+)
 def test_ambiguous_chessboards_are_read_as_they_hang(text: str, invert: bool, spin: float) -> None:
     target, picture, true = view(text, (20, 10, spin), noise=0.0, fill=0.6)
     if invert:  # the first square white

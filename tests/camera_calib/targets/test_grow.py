@@ -31,7 +31,10 @@ def matched(found: np.ndarray, true: np.ndarray, off_px: float) -> set[int]:
     return numbers
 
 
-@pytest.mark.parametrize("turn", [(0, 0, 0), (30, 25, 20), (-50, 10, 100)])
+@pytest.mark.parametrize(
+    "turn",
+    [(30, 25, 20), *(pytest.param(t, marks=pytest.mark.slow) for t in ((0, 0, 0), (-50, 10, 100)))],
+)
 def test_whole_boards_are_found(turn: tuple[float, float, float]) -> None:
     picture, true = view(turn)
     found = grown_chessboard(picture, (6, 9))

@@ -51,6 +51,7 @@ def fisheye_view() -> tuple[np.ndarray, np.ndarray]:
     return light_through(GRID, FISHEYE, pose.inv(), 10), FISHEYE.project(pose.apply(GRID.points))
 
 
+@pytest.mark.slow
 def test_neither_bits_nor_the_lens_pull_a_corner() -> None:
     light, true = fisheye_view()
     board = GRID.points[:, :2] / GRID.size_m

@@ -21,6 +21,7 @@ from tests.missions.live.flights import FLOOR_M, LoopFlight, small_plan
 GRACE_TICKS = 100
 
 
+@pytest.mark.slow
 def test_loop_flies_as_the_closed_loop_does() -> None:
     flight = LoopFlight()
     while flight.loop.state != LinkState.OVER and flight.vehicle.tick < 6000:
@@ -193,7 +194,7 @@ def test_odometry_says_how_well_it_knows_its_place(following: LoopFlight) -> Non
     assert following.loop.pilot.state.memory[SIGMA_M] == math.inf
 
 
-@pytest.mark.parametrize("on_loss", ["surface", "drift"])
+@pytest.mark.parametrize("on_loss", ["surface", pytest.param("drift", marks=pytest.mark.slow)])
 def test_a_lost_vehicle_comes_to_an_end(on_loss: str) -> None:
     flight = deepcopy(on_its_first_line(on_loss=on_loss))
     begun_s = flight.now_s

@@ -24,7 +24,10 @@ def test_a_resolution_gives_the_altitude_whose_pixel_it_is() -> None:
     assert [row["fits"] for row in data] == [True, False]
 
 
-@pytest.mark.parametrize("resolution_mm", [0.001, 0.05, 0.22, 2.0, 5.0])
+@pytest.mark.parametrize(
+    "resolution_mm",
+    [0.22, *(pytest.param(r, marks=pytest.mark.slow) for r in (0.001, 0.05, 2.0, 5.0))],
+)
 def test_a_resolution_beyond_all_lenses_is_refused_with_the_nearest_that_fits(
     resolution_mm: float,
 ) -> None:

@@ -87,6 +87,7 @@ def test_no_parting_is_better(
         assert numbers == list(range(dive.first_line, dive.last_line + 1))
 
 
+@pytest.mark.slow
 @given(
     count=st.integers(2, 8),
     energy=st.floats(1.05, 6.0),

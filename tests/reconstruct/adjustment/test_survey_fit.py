@@ -348,6 +348,7 @@ def smooth_shift(rng: np.random.Generator, pixels: np.ndarray, size: np.ndarray)
     return np.exp(-0.5 * (away**2).sum(axis=2)) @ heights
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shift_px", [0.0, 0.005])
 def test_shifts_that_pictures_share_move_no_exact_rig_beyond_its_sigmas(
     tmp_path: Path, shift_px: float

@@ -108,7 +108,7 @@ def test_depths_of_a_track_without_relief_give_no_scale(capsys: pytest.CaptureFi
     assert "too little for its scale" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("reading", ["depths", "positions"])
+@pytest.mark.parametrize("reading", ["depths", pytest.param("positions", marks=pytest.mark.slow)])
 def test_scale_and_level_of_one_camera_lie_within_their_sigmas(reading: str) -> None:
     """Of a track whose depth varies by 0.4 m, over 24 seeds of white errors."""
     scene, sigma_m = site().left, 0.01

@@ -146,6 +146,7 @@ def test_correlation_is_found() -> None:
         assert all("correlation_s" in how for how in fit.record.errors.values())
 
 
+@pytest.mark.slow
 def test_a_heading_that_turns_the_reckoned_track_too_is_one_error_not_two() -> None:
     """Compass error turns both headings and the positions integrated along them."""
     body, ratios = flight(), []
@@ -215,7 +216,7 @@ def test_a_clock_that_is_off_by_more_than_stated_is_named_with_its_setting(
     assert abs(abs(value) - 1.0) < 4 * sigma < 1.0
 
 
-@pytest.mark.parametrize("scatter_s", [1.0, 0.0])
+@pytest.mark.parametrize("scatter_s", [1.0, pytest.param(0.0, marks=SLOW)])
 def test_times_that_scatter_are_named_and_leave_the_heading_its_sigma(
     scatter_s: float, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -350,6 +351,7 @@ def test_a_single_line_without_attitude_does_not_know_its_roll() -> None:
     assert np.abs(error[3]) < 3 * sigma[3]
 
 
+@pytest.mark.slow
 def test_a_free_scale_has_a_sigma_that_holds_its_error() -> None:
     body, ratios = flight(), []
     for seed in range(5):

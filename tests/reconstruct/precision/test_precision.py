@@ -199,6 +199,7 @@ def test_measures_are_ranked_by_what_a_minute_buys() -> None:
     assert gains[0] > 0
 
 
+@pytest.mark.slow
 def test_the_report_of_a_planned_workspace_writes_what_it_says(tmp_path: Path) -> None:
     workspace = settings_in(tmp_path / "w", SMALL)
     run(["plan"], workspace, None, executor=SERIAL)

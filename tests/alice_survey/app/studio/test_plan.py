@@ -110,6 +110,7 @@ def test_a_saved_plan_is_the_command_lines(
     assert again | {"cpu_s": 0} == shown | {"cpu_s": 0}
 
 
+@pytest.mark.slow
 def test_a_new_survey_starts_from_the_commented_settings(tmp_path: Path) -> None:
     with serving(tmp_path) as server:
         found = get(server)

@@ -74,6 +74,7 @@ ALL_AT_ONCE = part.SensorSuite(
 )
 
 
+@pytest.mark.slow
 def test_a_run_equals_the_dense_twin() -> None:
     # Just under the surface, over deep water, every instrument has a say.
     sensors = ALL_AT_ONCE.pack()
