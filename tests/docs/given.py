@@ -95,20 +95,16 @@ def _reef(folder: Path, made: Made) -> None:
     _bring(folder, made.reef, made.reef.parent / "area.geojson")
 
 
-def _planned(folder: Path, made: Made) -> None:
-    """Only settings: what follows, the page's commands make."""
-    (folder / "reef").mkdir()
-    _bring(folder / "reef", made.reef / "survey.toml")
-    _bring(folder, made.reef.parent / "area.geojson")
-
-
 def _cameras(folder: Path, made: Made) -> None:
     files.boards(folder, air=True)
     _bring(folder, made.pool)
 
 
 def _certificate(folder: Path, made: Made) -> None:
-    _planned(folder, made)
+    """Planned and flown as in the tutorial."""
+    (folder / "reef").mkdir()
+    _bring(folder / "reef", *(made.reef / name for name in ("survey.toml", "plan", "flight")))
+    _bring(folder, made.reef.parent / "area.geojson")
     files.navigation(made.reef, folder / "dive.csv", dated=False)
     shutil.copy(made.reef / "flight/triggers.csv", folder / "t.csv")
 
@@ -206,7 +202,6 @@ GIVEN: dict[str, Callable[[Path, Made], None]] = {
     "how-to/robots.md": _robots,
     "cameras.md": _cameras,
     "certificate.md": _certificate,
-    "energy.md": _planned,
     "logs.md": _logs,
     "reconstruction.md": _reconstruction,
     "identification.md": _identified,
