@@ -208,7 +208,7 @@ def synthetic_tank(seed: int) -> list[VehicleLog]:
 def test_what_a_model_leaves_out_makes_no_prediction_worse() -> None:
     """A fit to three runs predicts three others, against what it began with."""
     worst, moved = [], []
-    for logs in map(synthetic_tank, (1, 3, 9, 17)):
+    for logs in map(synthetic_tank, (1, 3)):
         windows = [w for log in logs[:3] for w in make_windows(log, ROV, window_s=5.0, given="pq")]
         fit = fit_output_error(windows, PARAMETERS, max_step_s=QUICK_S, prior=PriorSigmas())
         others = [make_windows(log, ROV, window_s=10.0, given="pq") for log in logs[3:]]
@@ -221,5 +221,5 @@ def test_what_a_model_leaves_out_makes_no_prediction_worse() -> None:
         free = ~fit.at_start[[PARAMETERS.names.index(n) for n in ("X_uu", "Y_vv", "Z_ww", "N_rr")]]
         moved += gains[:, free].mean(axis=0).tolist()
     assert min(worst) > -5.0
-    assert 4 <= len(moved) <= 12
+    assert 2 <= len(moved) <= 6
     assert np.mean(moved) > 10.0
