@@ -18,7 +18,7 @@ help:
 	@echo "make test    run the tests of every day: 10 minutes on two busy cores, kernels compiled on the way"
 	@echo "make test-all  run these and the slow ones: the loop, kills, docs, browser, fuzzing, Monte Carlo"
 	@echo "make bench   run all benchmarks, for hours; table, logs and workspaces go into $(WORK)/"
-	@echo "make docs    build the site of docs/ into build/site/"
+	@echo "make docs    run the notebooks, for some minutes, and build the site of docs/ into build/site/"
 	@echo "make wheel   build a wheel with its kernels, for this version of Python, into dist/"
 	@echo "make check   lint (Python and JavaScript), types, import rules, and the bounds of make structure"
 	@echo "make lock    renew locks/ from pyproject.toml: demo.lock, test.lock and all.lock"
@@ -56,6 +56,7 @@ wheel: .venv/test.ready
 	$(BIN)/python -m tests.build_wheel dist
 
 docs: .venv/all.ready
+	$(BIN)/python -m tests.docs.notebooks build/notebooks
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 
 lint: .venv/test.ready

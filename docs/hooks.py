@@ -5,17 +5,19 @@ Nothing is fetched to show them.
 `pymdownx.arithmatex` finds `$...$` and `$$...$$` outside of code; what it found is converted here.
 """
 
+import base64
 import html
 import inspect
 import json
 import re
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 from latex2mathml.converter import convert
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.exceptions import PluginError
-from mkdocs.structure.files import Files
+from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 _INLINE = re.compile(r'<span class="arithmatex">\\\((.*?)\\\)</span>', re.S)
@@ -38,6 +40,48 @@ _PARTS = re.compile(
 _TIGHT_BAR = r'<mo stretchy="false" lspace="0" rspace="0">\1</mo>'
 
 
+def on_files(files: Files, *, config: MkDocsConfig) -> Files:
+    """Show each notebook as a page, with its results where `make docs` has run it."""
+    for path in sorted(Path(config.docs_dir).glob("notebooks/*.ipynb")):
+        cells = _cells(path)
+        run = Path(config.config_file_path).parent / "build/notebooks" / path.name
+        if run.is_file() and _sources(_cells(run)) == _sources(cells):
+            cells = _cells(run)
+        lines: list[str] = []
+        for number, cell in enumerate(cells):
+            text = "".join(cell["source"])
+            lines += [text if cell["cell_type"] == "markdown" else f"```python\n{text}\n```", ""]
+            for k, output in enumerate(cell.get("outputs", ())):
+                picture = f"notebooks/{path.stem}-{number}-{k}.png"
+                if "image/png" in output.get("data", {}):
+                    content = base64.b64decode(output["data"]["image/png"])
+                    files.append(File.generated(config, picture, content=content))
+                lines += [_result(output, picture), ""]
+        lines.append(f"[Download the notebook]({path.name}){{ download }}")
+        page = f"notebooks/{path.stem}.md"
+        files.append(File.generated(config, page, content="\n".join(lines)))
+    return files
+
+
+def _cells(path: Path) -> list[Any]:
+    return list(json.loads(path.read_text(encoding="utf-8"))["cells"])
+
+
+def _sources(cells: list[Any]) -> list[str]:
+    return ["".join(cell["source"]) for cell in cells]
+
+
+def _result(output: Any, picture: str) -> str:
+    """What a cell has shown, in Markdown; what went to standard error is left out."""
+    data = output.get("data", {})
+    if "image/png" in data:
+        return f"![What the code above draws]({Path(picture).name})"
+    if "text/html" in data:
+        return f"<div>{''.join(data['text/html'])}</div>"
+    text = "".join(data.get("text/plain", output.get("text", "")))
+    return f"```text\n{text.rstrip()}\n```" if text and output.get("name") != "stderr" else ""
+
+
 def on_page_content(content: str, *, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Replace the mathematics of a page; mkdocs calls it once Markdown has become HTML."""
     where = page.file.src_uri
@@ -55,7 +99,9 @@ def on_post_page(output: str, *, page: Page, config: MkDocsConfig) -> str:
 
 
 def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Put tables of what the code knows where a page asks for them."""
+    """Put tables of what the code knows where a page asks for them; link to notebooks as pages."""
+    if not page.file.src_uri.startswith("notebooks/"):
+        markdown = re.sub(r"(\(\S*notebooks/\w+)\.ipynb\)", r"\1.md)", markdown)
     return _TABLE.sub(lambda found: made_table(found[1], page.file.src_uri), markdown)
 
 

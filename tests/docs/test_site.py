@@ -17,6 +17,7 @@ from alice_survey.app.studio.jobs import _CODES_OF_STOP
 from alice_survey.core.errors import NOT_GOOD_ENOUGH
 from tests import structure
 from tests.alice_survey.kit.browser import Heard, chromium, is_accessible
+from tests.docs.notebooks import NOTEBOOKS
 from tests.docs.pages import DOCS, pages
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("site")]
@@ -52,7 +53,8 @@ def leaves(branch: Any) -> list[str]:
 
 def test_every_page_is_in_the_contents_once_and_was_built(site: Path) -> None:
     listed = leaves(SETTINGS["nav"])
-    assert sorted(listed) == sorted(str(page.relative_to(DOCS)) for page in pages())
+    notebooks = [path.with_suffix(".md") for path in NOTEBOOKS]
+    assert sorted(listed) == sorted(str(one.relative_to(DOCS)) for one in [*pages(), *notebooks])
     for page in listed:
         text = (site / page).with_suffix(".html").read_text(encoding="utf-8")
         assert re.search(r"<h1[ >]", text), page
@@ -144,7 +146,10 @@ def test_pages_open_from_disk_and_ask_for_nothing_else(site: Path, browser: Any)
         assert is_made or height <= 8_000, page
     tab.close()
     tab = browser.new_page(viewport={"width": 1280, "height": 900})
-    for name in ("index", "tutorial", "cameras", "paper-optics", "theory/placing", "measured/demo"):
+    for name in (
+        "index", "tutorial", "cameras", "paper-optics", "theory/placing", "measured/demo",
+        "notebooks/plan", "notebooks/compare",
+    ):  # fmt: skip
         tab.goto((site / f"{name}.html").as_uri())
         is_accessible(tab)  # it reads styles again, which browsers refuse to pages from disk
     tab.close()
