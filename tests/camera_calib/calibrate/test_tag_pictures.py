@@ -90,7 +90,7 @@ def light_of(camera: Camera, cam_from_target: RigidTransform) -> Array:
         return rays[:, :2] / ahead
 
     size = (camera.width_px, camera.height_px)
-    return picture_light(TARGET, matrix, size, fine=10, warp=tangents)
+    return picture_light(TARGET, matrix, size, warp=tangents)
 
 
 @pytest.mark.slow
