@@ -53,7 +53,7 @@ from tests.camera_calib.calibration_scenes import (
 from tests.cameras import changed
 
 NOISE_PX = 0.1
-TRIALS = 60
+TRIALS = 30
 TRUTH = built_rig()
 LENS = of_cameras(TRUTH, intrinsics("opencv5"))
 PORTS = (*of_ports(TRUTH), *pose_names(TRUTH))
@@ -65,17 +65,17 @@ def test_errors_reach_the_cramer_rao_bound_and_match_their_sigmas(known: Intrins
     """25 stereo views, 0.1 px, unknown ports; first values are those of the design.
 
     The bounds are the goals over 200 trials, and nearer ones; without the luck of the draws (see
-    `benchmarks.camera_calibration`) 60 trials give each figure to 1.5 %, so that no seed decides.
+    `benchmarks.camera_calibration`) 30 trials give each figure to 2 %, so that no seed decides.
     """
     mode = run_mode(known, range(TRIALS))
 
     found = {p.name: p for p in mode.parameters}
     ratios = [found[name].ratio_without_luck for name in RIG]
-    assert 0.95 < min(ratios) <= max(ratios) <= 1.05 < GOAL_OF_BOUND
+    assert 0.93 < min(ratios) <= max(ratios) <= 1.07 < GOAL_OF_BOUND
     low, high = GOAL_OF_SIGMA
     scores = [p.by_sigma_without_luck for p in mode.parameters]
     # Sigmas are a little large: variances of correlated noise are never found below 0.
-    assert low < 0.9 < min(scores) <= max(scores) < 1.05 < high
+    assert low < 0.88 < min(scores) <= max(scores) < 1.07 < high
     # Sizes that this geometry gives, so that the bound itself is checked.
     low_mm, high_mm = {"held": (0.2, 0.45), "prior": (0.3, 1.0), "free": (0.7, 2.4)}[known]
     assert low_mm < 1e3 * found["left.port_distance_m"].bound < high_mm
