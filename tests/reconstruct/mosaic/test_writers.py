@@ -60,9 +60,7 @@ def written(folder: Path, side_px: int) -> tuple[float, float]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "side_px", [8 * TILE_PX, pytest.param(33 * TILE_PX, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("side_px", [8 * TILE_PX, 17 * TILE_PX])
 def test_a_strip_across_a_large_box_takes_little(side_px: int, tmp_path: Path):
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
         share, peak_mib = pool.submit(partial(written, tmp_path, side_px)).result()
