@@ -281,9 +281,9 @@ def test_fish_of_the_judge_are_those_of_the_renderer() -> None:
 @pytest.mark.slow
 def test_masks_are_judged_by_what_moves_and_by_shadows(tmp_path: Path) -> None:
     station = fishy_station()
-    task = MaskTask(masks=tmp_path, planned=QUICK, scale=12, name="left", station=station)
-    pose = body_poses(QUICK)[station] * harbour_rig(12).body_from_cam("left")
-    fish = fish_in("left", 12, pose, time_of(station))
+    task = MaskTask(masks=tmp_path, planned=QUICK, scale=24, name="left", station=station)
+    pose = body_poses(QUICK)[station] * harbour_rig(24).body_from_cam("left")
+    fish = fish_in("left", 24, pose, time_of(station))
     nothing = shares(count_pixels(task))
     assert (nothing["recall"], nothing["still_masked"]) == (0.0, 0.0)
     (tmp_path / "left").mkdir()
