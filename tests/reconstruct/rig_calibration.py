@@ -17,7 +17,7 @@ from tests.oracles_targets import light_through, to_srgb
 from tests.reconstruct.rig_survey import command, four_cameras, places
 
 BOARD = parse_target("chessboard 9x6 40mm")
-VIEWS = 28
+VIEWS = 18
 _NOISE = 0.006
 """Of light, where white is 0.7."""
 HOUSINGS = (
