@@ -75,7 +75,7 @@ def test_four_cameras_are_calibrated_and_map_as_well_as_with_the_true_rig(tmp_pa
     for names in (NAMES, NAMES[1:]):
         workspace = tmp_path / f"of_{len(names)}"
         import_survey(pictures, found, workspace, names)
-        (workspace / "survey.toml").write_text("[reconstruct]\nmax_features = 3000\n")
+        (workspace / "survey.toml").write_text("[reconstruct]\nmax_features = 1500\n")
         run(["mapping", "placing"], workspace, None)
         check_places(*placed(workspace, LINES), LINES * MOMENTS * len(names))
         port = PortRecord.read(workspace / "sparse" / "port.json")
