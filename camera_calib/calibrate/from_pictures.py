@@ -222,8 +222,10 @@ def _kinds(chosen: Mapping[str, str], known: Iterable[str]) -> list[dict[str, st
 def _criteria(calibrations: Sequence[Calibration]) -> list[float]:
     """Schwarz's criterion of each; correlated corners count as so many fewer.
 
-    A point that one leaves out and another does not counts as the outlier that it is, and a port
-    unlike those that are built as unlikely: a dome whose glass is at the pupil passes for flat.
+    Pulls on the priors of lens and target add to it, as to the evidence by Laplace's method: else
+    the housing that strains them most fits best at no charge. A point that one leaves out and
+    another does not counts as the outlier that it is, and a port unlike those that are built as
+    unlikely: a dome whose glass is at the pupil passes for flat.
     """
     coordinates = [2 * int(np.isfinite(one.residuals_px[..., 0]).sum()) for one in calibrations]
     least = min(calibrations, key=lambda one: one.noise_px)
@@ -237,7 +239,9 @@ def _criteria(calibrations: Sequence[Calibration]) -> list[float]:
             for port in (camera.port for camera in one.rig.cameras.values())
             for name in port.spreads.keys() & {*port.estimated}
         )
-        criteria.append(cost / excess + parameters * math.log(most / excess) + unusual)
+        off, bent = one.freedom.prior.misfit(one.rig), one.shape.values / one.shape.prior_sigmas
+        pull = off @ one.freedom.prior.information @ off + bent @ bent
+        criteria.append(cost / excess + parameters * math.log(most / excess) + unusual + pull)
     return criteria
 
 
