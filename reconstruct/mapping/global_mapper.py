@@ -346,7 +346,9 @@ def refine_link(
         found, by_place = pinholes.see(turned + shift, camera)
         miss, away = found - pixels, np.einsum("nij,nj->ni", held, moved - points)
         by_point = by_place @ turn
-        back = np.linalg.inv(held + by_point.swapaxes(1, 2) @ by_point)
+        square = held + by_point.swapaxes(1, 2) @ by_point
+        # a wrong match near a camera's own plane leaves nothing of what stereo knows but rounding
+        back = np.linalg.inv(square * (1.0 + 1e-12 * np.eye(3)))
         pull = away + np.einsum("nij,ni->nj", by_point, miss)
         if first:  # the points alone, so that weights mean something
             moved = moved - np.einsum("nij,nj->ni", back, pull)
