@@ -48,6 +48,7 @@ def align_slowly(
     reference: np.ndarray,
     pixel: np.ndarray,
     affine: np.ndarray,
+    bend: np.ndarray,
     radius: int,
     sigma: float,
 ) -> np.ndarray:
@@ -62,7 +63,8 @@ def align_slowly(
 
     def misses(unknowns: np.ndarray) -> np.ndarray:
         x, y, a, b, c, d, gain, offset = unknowns
-        seen = level(second, x + a * u + b * v, y + c * u + d * v)
+        off_x, off_y = bend @ [u * u, u * v, v * v]
+        seen = level(second, x + a * u + b * v + off_x, y + c * u + d * v + off_y)
         return weight * (gain * seen + offset - wanted)
 
     start = np.concatenate([pixel, affine.ravel(), [1.0, 0.0]])

@@ -241,7 +241,9 @@ def _criteria(calibrations: Sequence[Calibration]) -> list[float]:
         )
         off, bent = one.freedom.prior.misfit(one.rig), one.shape.values / one.shape.prior_sigmas
         pull = off @ one.freedom.prior.information @ off + bent @ bent
-        criteria.append(cost / excess + parameters * math.log(most / excess) + unusual + pull)
+        criteria.append(
+            cost / excess + parameters * math.log(most / excess) + unusual + float(pull)
+        )
     return criteria
 
 

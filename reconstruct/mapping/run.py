@@ -183,6 +183,7 @@ def run_mapping(
         all_pixels(features),
         [_grey_file(path) for path in features],
         [(i, j, pair.matches) for i, j, pair in pairs],
+        [warps[record.camera] for record in inputs.records] if warps else [],
         executor=executor,
     )
     seen = Observations(
