@@ -5,8 +5,8 @@ from scipy.integrate import solve_ivp
 
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.dynamics import STATE, derivative, scratch_for
-from alice_survey.sim.vehicle.sea import constant_current
 from alice_survey.sim.vehicle.vehicle import Vehicle
+from tests.alice_survey.sim.vehicle.motions import STILL
 
 
 def integrated(vehicle: Vehicle, start: Array, rps: Array, at_s: Array, load: Array) -> Array:
@@ -15,7 +15,7 @@ def integrated(vehicle: Vehicle, start: Array, rps: Array, at_s: Array, load: Ar
     Thrusters keep their speeds rps (n,); a force and moment (6,) acts besides.
     """
     count = len(vehicle.thrusters)
-    scratch, water = scratch_for(count), constant_current(0.0, 0.0)
+    scratch, water = scratch_for(count), STILL
 
     def rate(time_s: float, state: Array) -> Array:
         out = np.zeros(STATE + count)

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import find_objects
+from scipy.ndimage import binary_fill_holes, distance_transform_edt, find_objects
 from scipy.spatial.transform import RigidTransform
 
 from alice_survey.core.artefacts import need_stage, refuse_links
@@ -261,10 +261,14 @@ def _measure(
     now: Elevation,
     noise_area: float,
 ) -> Region:
+    hidden = binary_fill_holes(inside) & np.isnan(maps[0])  # as the cells next to them
+    nearest = distance_transform_edt(~inside, return_distances=False, return_indices=True)
+    maps, inside = np.where(hidden, maps[:, *nearest], maps), inside | hidden
     values, sigma, registration = maps[:, inside]
     area = len(values) * now.cell**2
     random = np.sqrt(float(np.mean(sigma**2)) * area * noise_area)
     shared = area * float(np.mean(registration))
+    guessed = hidden.sum() * now.cell**2 * float(np.std(values))
     rows, columns = np.nonzero(inside)
     share = np.abs(values) / np.abs(values).sum()
     row, column = rows @ share + window[0].start, columns @ share + window[1].start
@@ -274,7 +278,7 @@ def _measure(
         north_m=now.north - (float(row) + 0.5) * now.cell,
         area_m2=area,
         volume_m3=float(values.sum()) * now.cell**2,
-        sigma_m3=float(np.hypot(random, shared)),
+        sigma_m3=float(np.linalg.norm([random, shared, guessed])),
         max_m=float(sign * np.percentile(sign * values, 95)),
     )
 

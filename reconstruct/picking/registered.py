@@ -31,8 +31,6 @@ class Sight:
     image: str
     pixel: Array
     """(2,) of the picture as taken, from the outer corner of the first."""
-    pixels_per_unit: float
-    """Resolution on the surface: square root of the pixels that a unit of area covers."""
     off_nadir_rad: float
     """Angle at the place between the normal of the surface and the way to the camera."""
 
@@ -146,21 +144,20 @@ class RegisteredPictures:
         facing = ways @ normal / np.linalg.norm(ways, axis=1)
         rows, facing = rows[facing > 0], facing[facing > 0]
         along = tangents(normal)
-        fine, rank = np.zeros(len(rows)), np.zeros(len(rows))
+        rank = np.zeros(len(rows))
         for number, warp in enumerate(self.warps.values()):
             mine = np.flatnonzero(self.camera[rows] == number)
             turns = self.turns[rows[mine]]
             arms = np.einsum("nij,ni->nj", turns, place - self.centres[rows[mine]])
             slopes = warp.camera.project_jacobian(arms)[1] @ turns.swapaxes(1, 2) @ along
-            fine[mine] = np.sqrt(np.abs(np.linalg.det(slopes)))
+            fine = np.sqrt(np.abs(np.linalg.det(slopes)))
             half = np.array(warp.size_px) / 2
             away = np.linalg.norm(pixels[rows[mine]] - half, axis=1) / np.linalg.norm(half)
-            rank[mine] = fine[mine] * (1.0 - _EDGE * away**2)
+            rank[mine] = fine * (1.0 - _EDGE * away**2)
         return [
             Sight(
                 image=self.names[rows[n]],
                 pixel=pixels[rows[n]],
-                pixels_per_unit=float(fine[n]),
                 off_nadir_rad=float(np.arccos(min(1.0, facing[n]))),
             )
             for n in np.argsort(-rank, kind="stable").tolist()

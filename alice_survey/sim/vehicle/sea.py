@@ -36,11 +36,6 @@ class Current(NamedTuple):
     """(T, Z, 2) towards north and east."""
 
 
-def constant_current(speed_mps: float, towards_deg: float) -> Current:
-    """The same current everywhere, always; the direction is the one it flows towards."""
-    return sheared_current(np.zeros(1), np.array([[speed_mps, towards_deg]]))
-
-
 def sheared_current(depth_m: Array, speed_mps_towards_deg: Array) -> Current:
     """A steady current that varies with depth.
 

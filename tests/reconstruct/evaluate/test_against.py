@@ -86,6 +86,17 @@ def test_the_same_ground_shows_no_change_and_chance_share_of_significant_cells()
     assert figures["lost"]["volume_l"] == pytest.approx(-1e3 * MOUND_M3, rel=0.05)
 
 
+def test_what_no_survey_sees_within_a_place_counts_as_the_cells_around_it() -> None:
+    still, mound = survey(1, STILL, 0.0), survey(2, STILL, MOUND_M)
+    row, column = int((4.0 - AT[1]) / CELL), int(AT[0] / CELL)
+    away = np.hypot(*np.ogrid[-row : SIDE - row, -column : SIDE - column]) * CELL
+    mound.height[away < 0.07] = np.nan  # a tenth of the volume
+    (region,) = compare_elevations(mound, still, STILL)[0].regions
+    error = region.volume_m3 - MOUND_M3
+    assert abs(error) < min(2.0 * region.sigma_m3, 0.05 * MOUND_M3)
+    assert region.sigma_m3 < 0.1 * MOUND_M3
+
+
 def test_a_far_shift_is_found_among_ripples() -> None:
     far = RigidTransform.from_translation([0.8, -0.6, 1.0])
     now, before = survey(5, STILL, 0.0), survey(6, far, 0.0)

@@ -11,8 +11,13 @@ from alice_survey.core.frames import Array, attitude_from_rotation
 from alice_survey.sim.vehicle.coefficients import Coefficients
 from alice_survey.sim.vehicle.dynamics import Body, derivative, initial_state, rk4_step, scratch_for
 from alice_survey.sim.vehicle.propulsion import Thruster
-from alice_survey.sim.vehicle.sea import Current, constant_current
+from alice_survey.sim.vehicle.sea import Current, sheared_current
 from alice_survey.sim.vehicle.vehicle import RigidBody, Vehicle, vehicle_from
+
+
+def constant_current(speed_mps: float, towards_deg: float) -> Current:
+    return sheared_current(np.zeros(1), np.array([[speed_mps, towards_deg]]))
+
 
 NOTHING = np.zeros(6)
 STILL = constant_current(0.0, 0.0)

@@ -15,7 +15,7 @@ from alice_survey.core.config import COEFFICIENTS as SETS
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle import dynamics
 from alice_survey.sim.vehicle.propulsion import add_thrust
-from alice_survey.sim.vehicle.sea import GRAVITY, Current, constant_current, sheared_current
+from alice_survey.sim.vehicle.sea import GRAVITY, Current, sheared_current
 from alice_survey.sim.vehicle.vehicle import Vehicle, vehicle_from
 from tests import oracles_dynamics as oracle
 from tests.alice_survey.sim.vehicle import motions as m
@@ -280,7 +280,7 @@ def test_a_uniform_current_carries_the_motion_along(
     state = m.state_of(vehicle, np.array([surge, 0.1, -0.1, 0.2, 0.1, -0.3]), attitude)
     commands = np.array([30.0, -20.0, 15.0, 25.0, -30.0])
     still = m.advance(vehicle, state, 5.0, command_rps=commands)[-1]
-    current = constant_current(speed, towards_deg)
+    current = m.constant_current(speed, towards_deg)
     carried = m.advance(vehicle, state, 5.0, command_rps=commands, current=current)[-1]
     direction = math.radians(towards_deg)
     along = 5.0 * speed * np.array([math.cos(direction), math.sin(direction), 0.0])
@@ -384,7 +384,7 @@ def test_it_rises_slower_than_it_sinks_where_drag_differs() -> None:
     eta = np.concatenate([turning[:3], (0.1, 0.2, 0.3)])
     _, expected, _ = oracle.derivative(
         0.0, eta, turning[7:13], np.zeros(0), np.zeros(0), np.zeros(6), vehicle,
-        constant_current(0.0, 0.0),
+        m.constant_current(0.0, 0.0),
     )  # fmt: skip
     np.testing.assert_allclose(m.rates(vehicle, turning)[7:13], expected, atol=1e-12)
 
@@ -480,7 +480,7 @@ def test_small_roll_and_pitch_swing_like_a_pendulum(axis: int, coefficients: str
 def test_a_vehicle_at_rest_takes_on_a_current_as_it_coasts_down() -> None:
     """Held over ground in 0.4 m/s abeam, then let go: v_r = v_0 / (1 + |Y_vv| v_0 t / m)."""
     vehicle = m.block({"Y_vv": -200.0, "Y_vdot": -70.0})
-    current = constant_current(0.4, 90.0)
+    current = m.constant_current(0.4, 90.0)
     states = m.advance(vehicle, m.state_of(vehicle, -0.4 * m.V), 60.0, 0.02, current=current)
     over_ground = m.rotations(states).apply(states[:, 7:10]) + 0.4 * np.eye(3)[1]
     lagging = 0.4 / (1.0 + 200.0 * 0.4 * np.arange(len(states)) * 0.02 / 120.0)

@@ -13,6 +13,7 @@ from alice_survey.core.errors import AliceError
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle import sea
 from alice_survey.sim.vehicle.sea import FloorGrid, floor_depth, floor_range, level_floor
+from tests.alice_survey.sim.vehicle import motions
 
 TIMES, DEPTHS = np.array([0.0, 7.0, 10.0, 31.0]), np.array([-1.0, 2.0, 2.5, 20.0, 21.0])
 
@@ -33,7 +34,7 @@ def test_the_direction_is_the_one_it_flows_towards(
     towards_deg: float, north: float, east: float
 ) -> None:
     for time_s, depth_m in ((0.0, 0.0), (1e5, -3.0), (-5.0, 1e4)):
-        value = at(sea.constant_current(0.2, towards_deg), time_s, depth_m)
+        value = at(motions.constant_current(0.2, towards_deg), time_s, depth_m)
         np.testing.assert_allclose(value, [north, east, 0, 0, 0, 0], atol=1e-16)
 
 
@@ -137,7 +138,9 @@ def test_wave_numbers_obey_the_dispersion_relation(period_s: float, depth_m: flo
 
 def test_swell_is_added_to_the_current_along_its_way() -> None:
     depth_m, period_s, towards = 15.0, 6.0, math.radians(30.0)
-    current = sea.with_swell(sea.constant_current(0.1, 90.0), 0.5, period_s, 30.0, depth_m, 60.0)
+    current = sea.with_swell(
+        motions.constant_current(0.1, 90.0), 0.5, period_s, 30.0, depth_m, 60.0
+    )
     maximum = float(sea.orbital_speed_mps(0.5, period_s, depth_m, 12.5))
     for time_s in (0.0, 1.0, 17.3, 42.0):
         waves = at(current, time_s, 12.5)[:2] - [0.0, 0.1]

@@ -10,12 +10,13 @@ from alice_survey.sim.vehicle.dynamics import rk4_step, scratch_for
 from alice_survey.sim.vehicle.navigation.sensors import SensorSuite
 from alice_survey.sim.vehicle.pilot.memory import APPROACH, ASCEND, DIVE, DONE, FOLLOW, PHASE
 from alice_survey.sim.vehicle.pilot.settings import pilot_guidance
-from alice_survey.sim.vehicle.sea import Disturbance, constant_current, level_floor
+from alice_survey.sim.vehicle.sea import Disturbance, level_floor
 from alice_survey.sim.vehicle.simulator import STEPS, TICK_S, Flown, Setup, simulate
 from alice_survey.sim.vehicle.vehicle import vehicle_from
+from tests.alice_survey.sim.vehicle import motions
 from tests.alice_survey.sim.vehicle.pilot.pilot_runs import gains_of, straight
 
-CURRENT = constant_current(0.1, 60.0)
+CURRENT = motions.constant_current(0.1, 60.0)
 STILL = Disturbance()
 GUSTS = Disturbance(sigma=(3.0, 3.0, 3.0, 0.0, 0.0, 0.0))
 

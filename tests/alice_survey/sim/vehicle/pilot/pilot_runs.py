@@ -20,8 +20,9 @@ from alice_survey.sim.vehicle.pilot.mission import NO_MISSION
 from alice_survey.sim.vehicle.pilot.path import Path, path_from_legs
 from alice_survey.sim.vehicle.pilot.settings import Guidance, Tick, pilot_guidance
 from alice_survey.sim.vehicle.rotations import matrix_rows
-from alice_survey.sim.vehicle.sea import Current, constant_current, current_at
+from alice_survey.sim.vehicle.sea import Current, current_at
 from alice_survey.sim.vehicle.vehicle import vehicle_from
+from tests.alice_survey.sim.vehicle import motions
 
 Controller = Literal["sway", "los"]
 TICK_S = 0.05
@@ -250,7 +251,7 @@ def launch(
         at_ned = (at_ned[0], at_ned[1], floor_m - path.altitude_m - guidance.point_body_m[2])
     n = len(craft.thrusters)
     return Flight(
-        path, guidance, gains, craft.plant, constant_current(*current),
+        path, guidance, gains, craft.plant, motions.constant_current(*current),
         dynamics.initial_state(np.array(at_ned), np.array([0.0, 0.0, heading_rad]), n),
         np.array([floor_m, slope, 1.0]), pilot, np.zeros(6),
     )  # fmt: skip
