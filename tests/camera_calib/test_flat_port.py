@@ -282,3 +282,8 @@ def test_pixels_do_not_know_the_unit_of_length(factor: float, x: float, y: float
     larger = changed(camera, port_distance_m=0.02 * factor, glass_thickness_m=0.01 * factor)
 
     np.testing.assert_allclose(larger.project(factor * point), camera.project(point), atol=1e-8)
+
+
+def test_a_normal_that_is_rounded_is_a_unit_vector_to_rays() -> None:
+    rounded = FlatPort(port_distance_m=0.02, normal=(0.01, 0.0, 0.9999505))
+    assert np.linalg.norm(rounded.values[-3:]) == pytest.approx(1.0, abs=1e-15)
