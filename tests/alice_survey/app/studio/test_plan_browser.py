@@ -168,20 +168,26 @@ def test_a_base_map_lies_where_pyproj_puts_it(browser: Any, tmp_path: Path) -> N
         address = page.get_by_label("Address of its tiles")
         address.fill("https://tiles.example/{z}/{x}/{y}.png")
         address.press("Tab")
-        loaded = (
-            "[...document.querySelectorAll('.leaflet-under-pane img')].filter(one => one.complete)"
+        tiles = "[...document.querySelectorAll('.leaflet-under-pane img')]"
+        page.wait_for_function(
+            f"() => {tiles}.length && {tiles}.every((one) => one.complete)", timeout=60_000
         )
-        page.wait_for_function(f"{loaded}.length", timeout=20_000)
-        found = page.evaluate(f"{loaded}.map(one => [one.src, one.getBoundingClientRect()])")
+        canvas, box, found = page.evaluate(  # at one time: a plan that comes moves the map
+            "() => [document.getElementById('map-canvas')].map((one) => [{...one.dataset},"
+            f" one.getBoundingClientRect(), {tiles}.map("
+            "(tile) => [tile.src, tile.getBoundingClientRect()])])[0]"
+        )
+        middle = np.array([float(canvas["east"]), float(canvas["north"])])
+        on_screen = np.array([box["x"] + box["width"] / 2, box["y"] + box["height"] / 2])
         area = SurveyConfig().area
         local = f"+proj=aeqd +lat_0={area.latitude_deg} +lon_0={area.longitude_deg} +ellps=WGS84"
         to_local = Transformer.from_crs("EPSG:3857", local, always_xy=True)
-        for source, box in found:
+        for source, shown in found:
             z, x, y = map(int, source.removesuffix(".png").split("/")[-3:])
             side = 2 * np.pi * 6378137 / 2**z
-            corner = x * side - np.pi * 6378137, np.pi * 6378137 - y * side
-            east, north = to_local.transform(*corner)
-            assert plan.at(north, east) == pytest.approx((box["x"], box["y"]), abs=1.5)
+            corner = to_local.transform(x * side - np.pi * 6378137, np.pi * 6378137 - y * side)
+            away = (np.array(corner) - middle) * 2 ** float(canvas["zoom"]) * [1, -1]
+            assert on_screen + away == pytest.approx([shown["x"], shown["y"]], abs=1.5)
         assert 4 <= len(found) < 200
         address.fill("")
         address.press("Tab")
