@@ -1,6 +1,7 @@
 """A plan that flies parts of a survey again, as a workspace of its own."""
 
 import hashlib
+import itertools
 import json
 import math
 from collections.abc import Sequence
@@ -72,7 +73,8 @@ def refly_plan(
     """Plan short lines over parts of a survey, at the overlap of its plan.
 
     The new plan is whole: `fly`, exports and `plan check` take it as any other. Its survey area is
-    the parts (what the ties show, where there are none), its allowed area the plan's. Where a part
+    the parts (what the ties show, where there are none), its allowed area the plan's. It keeps the
+    altitude; by depth, that above the shallowest place of a bathymetry. Where a part
     ends between two middles of cells is not known: the whole step counts as missed.
 
     Args:
@@ -119,7 +121,10 @@ def refly_plan(
         length_m=sum(dive.route.length_m for dive in dives),
         duration_s=sum(dive.duration_s for dive in dives),
         energy_wh=sum(dive.energy_wh for dive in dives),
+        seafloor_depth_m=min(itertools.chain(*plan.line_floors_m), default=plan.seafloor_depth_m),
         line_depths_m=(),
+        line_floors_m=(),
+        way_depths_m=(),
         details={"refly_of": plan.name, "area_m2": multipolygon(seen).area},
     )
     seen_alone = certificate(again.area, rig, stations_of_plan(again), pattern)

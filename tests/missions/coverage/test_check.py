@@ -1,4 +1,5 @@
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from missions.fly.check import check_report, rig_of
 from missions.route.ways import Ways
 from missions.values.line import Line
 from missions.values.navigation import write_navigation
-from missions.values.plan_file import read_plan
+from missions.values.plan_file import Plan, read_plan
 from tests.missions.coverage.logs import log_of, write_triggers
 from tests.missions.exports.plans import RIG
 from tests.missions.follow.dives import workspace_of
@@ -40,13 +41,15 @@ def certified(stations: Stations) -> Certificate:
     return certificate(PLAN.area, RIG, stations, plan_pattern(PLAN, RIG))
 
 
-def checked_dive(workspace: Path, flown: Stations, **out: Any) -> tuple[str, dict]:
+def checked_dive(
+    workspace: Path, flown: Stations, plan: Plan = PLAN, **out: Any
+) -> tuple[str, dict]:
     """The report of a workspace with a plan, and the log and triggers of a dive."""
     time_s = 50.0 + PLAN.interval_s * np.arange(len(flown), dtype=float)
     flown, at = replace(flown, time_s=time_s), workspace / "triggers.csv"
-    write_navigation(workspace / "nav.csv", log_of(flown, PLAN, RIG), DATUM)
+    write_navigation(workspace / "nav.csv", log_of(flown, plan, RIG), DATUM)
     write_triggers(at, flown)
-    workspace_of(workspace, PLAN)
+    workspace_of(workspace, plan)
     return check_report(workspace, CONFIG, workspace / "nav.csv", triggers=at, **out)
 
 
@@ -116,6 +119,22 @@ def test_the_plan_for_the_holes_is_whole_and_closes_them(checked: tuple[Path, st
     both = join(FLOWN, stations_of_plan(again))
     assert certified(both).share_at_overlap >= 0.9999
     assert (workspace / "check" / "refly" / "plan" / "exports" / "about.txt").is_file()
+
+
+def test_holes_over_a_bathymetry_are_flown_above_its_shallowest_place(tmp_path: Path) -> None:
+    floors = [PLAN.seafloor_depth_m + np.linspace(-0.4, 0.3, line.stations) for line in PLAN.lines]
+    over = replace(
+        PLAN,
+        line_floors_m=tuple(tuple(floor.tolist()) for floor in floors),
+        line_depths_m=tuple(tuple((floor - PLAN.altitude_m).tolist()) for floor in floors),
+        way_depths_m=tuple((math.nan,) * len(dive.route.legs) for dive in PLAN.dives),
+    )
+    checked_dive(tmp_path, FLOWN, over)
+    folder = tmp_path / "check" / "refly" / "plan"
+    again = read_plan(folder / "plan.json")
+    assert again.seafloor_depth_m == pytest.approx(PLAN.seafloor_depth_m - 0.4)
+    assert again.stations > 0 and not again.line_depths_m
+    assert (folder / "exports" / "about.txt").is_file()
 
 
 def test_a_complete_dive_leaves_no_plan(tmp_path: Path) -> None:
