@@ -318,7 +318,7 @@ class MeasureCommand(WorkspaceCommand, ReportCommand):
     output: Path | None = option(
         None, "Write polygons and figures: .csv or .geojson.", "-o", "--output", metavar="FILE"
     )
-    pick_sigma: float = option(0.0, "Sigma of a picked pixel, or of a polygon's corner, px.", ge=0)
+    pick_sigma: float = option(0.5, "Sigma of a pick by eye, or of a polygon's corner, px.", ge=0)
 
     def run(self) -> Result:
         """Measure either."""

@@ -64,14 +64,19 @@ def test_lengths_of_one_station_are_as_far_off_as_their_sigmas_say(station: Path
     words = " ".join(f"left/a.png:{x:.1f},{y:.1f}" for x, y in pixels - 0.5)  # as viewers count
     _, data = measure(station, words)
     each = [word for point in words.split() for word in ("--points", point)]
-    said = CliRunner().invoke(app, ["measure", str(station), *each, "--json"])
+    said, by_eye = (
+        CliRunner().invoke(app, ["measure", str(station), *each, *exact, "--json"])
+        for exact in (("--pick-sigma", "0"), ())
+    )
     assert json.loads(said.stdout) == json.loads(json.dumps(data)), said.output
+    usual = [one["sigma_of_pixels_m"] for one in json.loads(by_eye.stdout)["distances"]]
     true = surface_points(rig.cameras["left"], rig.cam_from_rig["left"].inv(), pixels)
     lengths = np.linalg.norm(np.diff(true, axis=0), axis=1)
     found, own, shared = (
         np.array([one[key] for one in data["distances"]])
         for key in ("value_m", "sigma_of_pixels_m", "sigma_of_calibration_m")
     )
+    assert np.all(usual > own) and np.median(usual / own) > 1.2
     assert 0.6 < np.sqrt(np.mean(((found - lengths) / own) ** 2)) < 1.6
     assert np.sqrt(np.mean((found - lengths) ** 2)) < 2e-3
     # a baseline that is known to 0.2 % scales all lengths together
