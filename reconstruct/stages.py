@@ -94,7 +94,7 @@ def _placing_summary(folder: Path) -> Summary:
         and "rig" in (found.scale_source or "")
     ):
         share, sigma = place.scale_of_navigation or math.nan, place.scale_of_navigation_sigma
-        text += f", that of navigation {share:.4f} of it, sigma {sigma:.2g}"
+        text += f", that of navigation {share:#.5g} of it, sigma {sigma:.2g}"
     if found.joints:
         text += f"; {len(found.joints) + 1} parts that navigation alone joins, to " + " and ".join(
             f"{math.hypot(joint.sigma_north_m, joint.sigma_east_m, joint.sigma_depth_m):.2g} m"
