@@ -158,7 +158,8 @@ def _scale(held: Held) -> Iterator[Verdict]:
             good=abs(off) <= _SURE_SIGMAS * sigma,
         )
     else:
-        yield _verdict(source, "Measure a known length.", good="rig" in source)
+        which = "second known length, as a check" if "length" in source else "known length"
+        yield _verdict(source, f"Measure a {which}.", good="rig" in source)
 
 
 def _surface(held: Held) -> Iterator[Verdict]:

@@ -1,3 +1,4 @@
+import re
 from pathlib import Path
 from typing import Any
 
@@ -5,6 +6,7 @@ import pytest
 
 from alice_survey.app.report.held import Held
 from alice_survey.app.report.verdicts import facts, summary, verdicts
+from alice_survey.app.stages import spec
 from alice_survey.core.artefacts import write_json
 from alice_survey.kit.document import Verdict
 from tests.alice_survey.app.report.tiny import tiny_workspace
@@ -40,6 +42,7 @@ JOINT = {"stations": 7, "sigma_north_m": 0.03, "sigma_east_m": 0.04, "sigma_dept
         ({"joints": [JOINT]}, "7 stations show nothing that the others show", "look",
          "across the gap"),
         ({"joints": [JOINT]}, "sigma of 5", "look", ""),
+        ({"scale_source": "scaled by one known length"}, "one known length", "look", "second"),
         ({"georeference": navigation(0.99)}, "navigation's differs", "look", ""),
         ({"georeference": navigation(0.999)}, "navigation's differs", "good", ""),
         ({"georeference": navigation(1.01)}, "navigation's differs", "look", ""),
@@ -51,6 +54,13 @@ def test_a_model_is_judged_and_the_next_step_named(
     held, found = judged(tiny_workspace(tmp_path, sparse=sparse))
     assert level_of(found, words) == level
     assert next_step in summary(held, found)["What to do next"]
+
+
+def test_a_scale_of_navigation_beyond_reason_has_few_digits(tmp_path: Path) -> None:
+    georeference = navigation(1.785e136)
+    tiny_workspace(tmp_path, sparse={"scale_source": "the rig", "georeference": georeference})
+    text = spec("placing").summary(tmp_path / "sparse")[0]
+    assert "e+136" in text and not re.search(r"\d{9}", text)
 
 
 def test_a_model_without_scale_is_bad_and_says_what_to_do(tmp_path: Path) -> None:
