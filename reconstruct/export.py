@@ -27,9 +27,9 @@ from scipy.ndimage import map_coordinates
 
 from alice_survey.core import products
 from alice_survey.core.artefacts import Stage, atomic_path, run_stage, write_json
-from alice_survey.core.errors import ConfigError, ReconstructionError
+from alice_survey.core.errors import ConfigError, ReconstructionError, warn
 from alice_survey.core.executor import Executor
-from alice_survey.core.frames import Array
+from alice_survey.core.frames import Array, is_beyond
 from alice_survey.core.records import MeshRecord, SurfaceRecord
 from alice_survey.core.run import progress
 from reconstruct.copc import PointSpool, write_copc
@@ -102,14 +102,9 @@ def export_projected(workspace: Path, crs: str) -> tuple[str, dict[str, Any]]:
         inputs=[workspace / name for name in ("dense", "mosaic", "mesh")],
     )
     run_stage(workspace, stage, partial(_write_projected, workspace, target))
-    text = (
-        f"{crs}: {target.crs.name}; heights above {frame.vertical_datum}; in {workspace / folder}"
-    )
-    return text, {
-        "folder": str(workspace / folder),
-        "crs": target.crs.name,
-        "vertical_datum": frame.vertical_datum,
-    }
+    name, datum, folder = target.crs.name, frame.vertical_datum, str(workspace / folder)
+    text = f"{crs}: {name}; heights above {datum}; in {folder}"
+    return text, {"folder": folder, "crs": name, "vertical_datum": datum}
 
 
 def destination(crs: str, frame: WorldFrame) -> Destination:
@@ -133,6 +128,12 @@ def destination(crs: str, frame: WorldFrame) -> Destination:
         raise ConfigError(
             f"--crs {crs}: {found.name} is not a projected system in metres, horizontal alone: "
             f"take the UTM zone, such as EPSG:32636; heights stay above {frame.vertical_datum}"
+        )
+    area, datum = found.area_of_use, frame.datum
+    if area is not None and is_beyond(area, datum.latitude_deg, datum.longitude_deg):
+        warn(
+            f"--crs {crs}: the survey is at {datum.place}, outside of where {found.name} is used "
+            f"({area.west:g} to {area.east:g} E): its UTM zone is EPSG:{datum.utm_epsg}"
         )
     local = pyproj.CRS.from_wkt(local_crs(frame.datum).to_wkt())
     to = pyproj.Transformer.from_crs(local, found, always_xy=True)

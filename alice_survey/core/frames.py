@@ -201,7 +201,7 @@ def degrees_from(system: str) -> Callable[[float, float], tuple[float, float]] |
             raise ValueError(f"{x}, {y} is not a place in {as_line(crs.name)}") from None
         if not abs(latitude) <= _POLE_DEG:
             raise ValueError(f"latitude {latitude:g}: are latitude and longitude exchanged?")
-        if area is not None and not outside and _is_beyond(area, latitude, longitude):
+        if area is not None and not outside and is_beyond(area, latitude, longitude):
             outside.append((x, y))
             warn(
                 f"{x:.10g}, {y:.10g} is latitude {latitude:.4f}, longitude {longitude:.4f}, "
@@ -213,7 +213,7 @@ def degrees_from(system: str) -> Callable[[float, float], tuple[float, float]] |
     return degrees
 
 
-def _is_beyond(area: Any, latitude_deg: float, longitude_deg: float) -> bool:
+def is_beyond(area: Any, latitude_deg: float, longitude_deg: float) -> bool:
     """Whether a place lies outside of pyproj's area of use, which may cross the antimeridian."""
     width = ((area.east - area.west) % 360.0 or 360.0) + 2.0 * _BEYOND_DEG
     off = max(area.south - latitude_deg, latitude_deg - area.north)

@@ -6,9 +6,10 @@ import pytest
 import rasterio
 from pyproj import Transformer
 
-from alice_survey.core.errors import WorkspaceError
+from alice_survey.core.errors import WorkspaceError, keep_warnings
 from reconstruct import elevation
 from reconstruct.elevation import StoredElevation
+from reconstruct.export import destination
 from reconstruct.raster import (
     DemGrid,
     hillshade,
@@ -214,3 +215,10 @@ def test_cells_beyond_a_raster_are_unknown(
     blocks = expected[: rows // 3 * 3, : columns // 3 * 3].reshape(rows // 3, 3, columns // 3, 3)
     np.testing.assert_array_equal(coarse, np.where(np.isnan(blocks).any((1, 3)), np.nan,
                                                    blocks[:, 1, :, 1]))  # fmt: skip
+
+
+@pytest.mark.parametrize(("crs", "warned"), [("EPSG:32636", 0), ("EPSG:32632", 1)])
+def test_a_system_of_another_zone_is_warned_of_with_the_right_one(crs: str, warned: int) -> None:
+    with keep_warnings() as said:
+        destination(crs, FRAME)
+    assert len(said) == warned and all("EPSG:32636" in text for text in said)
