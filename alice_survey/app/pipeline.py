@@ -86,6 +86,11 @@ def run(
                 )
     from alice_survey.app.computing import task_memory_mib
 
+    if "placing" in stages and (control := workspace / "control.csv").is_file():
+        from reconstruct.placing.control_points import read_control
+
+        read_control(control)
+
     def say_result(stage: StageSpec, folder: Path) -> None:
         text = stage.summary(folder)[0].replace(str(folder), str(workspace / stage.folder))
         say(f"{stage.name}: {text}", folder)

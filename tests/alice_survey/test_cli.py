@@ -5,6 +5,7 @@ import json
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -20,11 +21,19 @@ from typer.testing import CliRunner
 
 from alice_survey.app.cli.main import GROUPS, app, main
 from alice_survey.app.commands import COMMANDS
-from alice_survey.app.pipeline import init_survey
+from alice_survey.app.pipeline import init_survey, run
 from alice_survey.app.stages import names
 from alice_survey.core.config import CameraConfig, WaterConfig, load_config
-from alice_survey.core.errors import ImageError, PlanError, WorkspaceError, extra, offer
+from alice_survey.core.errors import (
+    ConfigError,
+    ImageError,
+    PlanError,
+    WorkspaceError,
+    extra,
+    offer,
+)
 from camera_calib.rig import design_rig, write_rig
+from tests.alice_survey.app.report.tiny import tiny_workspace
 
 
 def test_help_loads_nothing_heavy() -> None:
@@ -338,5 +347,15 @@ def test_pictures_become_a_report_in_one_command(
         assert ran == [(n, dive) for n in (*names("calibrate", "reconstruct"), "report")]
         assert (dive / "images").is_dir() and not list((tmp_path / "a").glob("*/"))
         ran.clear()
-    refused = CliRunner().invoke(app, ["reconstruct", str(tmp_path / "b"), "-o", str(dive)])
-    assert isinstance(refused.exception, WorkspaceError) and not ran
+    for folder, fault in ((tmp_path / "b", WorkspaceError), (dive, ConfigError)):
+        refused = CliRunner().invoke(app, ["reconstruct", str(folder), "-o", str(dive)])
+        assert isinstance(refused.exception, fault) and not ran
+    shutil.copytree(dive / "images", dive / "report")
+    done = CliRunner().invoke(app, ["reconstruct", "-w", str(dive)])
+    assert f"alice-survey report -w {dive}" in done.output.splitlines()[-1]
+
+
+def test_control_is_read_before_the_pictures(tmp_path: Path) -> None:
+    (tmp_path / "control.csv").write_text("kind,name,use\npoint,A,perhaps\n")
+    with pytest.raises(WorkspaceError, match="line 2"):
+        run(["mapping", "placing"], tiny_workspace(tmp_path), None)

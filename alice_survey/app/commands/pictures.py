@@ -15,7 +15,7 @@ from alice_survey.app.commands.base import (
     argument,
     option,
 )
-from alice_survey.core.errors import ConfigError
+from alice_survey.core.errors import ConfigError, offer
 
 
 class ImportImagesCommand(WorkspaceCommand, ThreadsCommand):
@@ -263,32 +263,33 @@ class ReconstructCommand(DeviceCommand):
 
     def run(self) -> Result:
         """Run the stages, then write for other programs."""
-        from alice_survey.app.pipeline import run
+        from alice_survey.app.pipeline import run, stage_states
 
+        stages, workspace = self.stages(), self.output or self.workspace
         if self.output is not None:
-            shared = {"workspace": self.output, "threads": self.threads}
+            if self.output.resolve() == self.workspace.resolve():
+                raise ConfigError(f"-o {self.output} holds the pictures: name a new folder")
+            shared = {"workspace": workspace, "threads": self.threads}
             ImportImagesCommand(folders=[self.workspace], quiet=True, **shared).run()
-            rest = self.model_copy(update={"workspace": self.output, "output": None})
-            text, values = rest.run()
-            self.say(text)
-            more, values["report"] = run(["report"], self.output, self.survey, self.executor())
-            return f"{text}\n{more}", values
+            stages.append("report")
         with self.started_executor(self.device) as executor:
             changes = {"reconstruct": {"planes": self.plane}}
-            text, values = run(self.stages(), self.workspace, self.survey, executor, changes)
+            text, values = run(stages, workspace, self.survey, executor, changes)
             if self.export is not None:
                 from reconstruct.export import export_copies, export_undistorted
 
                 if self.export == "undistorted":
-                    more, values[self.export] = export_undistorted(self.workspace, executor)
+                    more, values[self.export] = export_undistorted(workspace, executor)
                 else:
-                    more, values[self.export] = export_copies(self.workspace)
+                    more, values[self.export] = export_copies(workspace)
                 text = f"{text}\n{more}"
         if self.crs is not None:
             from reconstruct.export import export_projected
 
-            more, values["crs"] = export_projected(self.workspace, self.crs)
+            more, values["crs"] = export_projected(workspace, self.crs)
             text = f"{text}\n{more}"
+        if stage_states(workspace, self.settings())["report"].startswith("stale"):
+            text += f"\nthe report is out of date: {offer('report', '-w', workspace)}"
         return text, values
 
 
