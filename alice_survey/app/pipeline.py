@@ -206,6 +206,10 @@ def settings(workspace: Path, survey: Path | None, *, needed: bool) -> SurveyCon
     begin, real = offer("init", workspace), stage_command("import-images", workspace)
     if (workspace / "images.partial").exists():
         raise ConfigError(f"an import into {workspace} has not finished: do it again, {real!r}")
+    from reconstruct.pictures.files import kind_of
+
+    if any(map(kind_of, workspace.glob("*.*"))):
+        real = offer("reconstruct", workspace, "-o", "dive")
     raise ConfigError(
         f"no survey.toml in {workspace} or here: {begin!r} writes one, and {real!r} makes a survey "
         "of pictures"

@@ -34,7 +34,7 @@ IN_FOLDERS = "in folders inside"
 ADVICE = {
     "HEIC": "save them as JPEG",
     "video": "take its frames with --video, into a workspace of their own",
-    IN_FOLDERS: "take them with --recursive, or give these folders too",
+    IN_FOLDERS: "take them with 'import-images --recursive', or give these folders too",
     "other files": "their names are not those of pictures",
 }
 _GPS, _EXIF, _FOCAL, _FOCAL_35 = 0x8825, 0x8769, 0x920A, 0xA405

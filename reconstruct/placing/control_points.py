@@ -193,16 +193,11 @@ def read_picks(path: Path) -> list[Pick]:
             x, y, sigma = (read_number(row.get(n, ""), n) for n in ("x", "y", "sigma_px"))
             if math.isnan(x + y) or sigma <= 0:
                 raise ValueError("x, y and sigma_px must be numbers")
-        picks.append(
-            Pick(
-                image=row["image"],
-                point=row["point"],
-                x_px=x + 0.5,
-                y_px=y + 0.5,
-                sigma_px=PICK_SIGMA_PX if math.isnan(sigma) else sigma,
-                matched_to=row.get("matched_to", ""),
-            )
-        )
+        picks.append(Pick(
+            image=row["image"], point=row["point"], x_px=x + 0.5, y_px=y + 0.5,
+            sigma_px=PICK_SIGMA_PX if math.isnan(sigma) else sigma,
+            matched_to=row.get("matched_to", ""),
+        ))  # fmt: skip
     return picks
 
 

@@ -556,8 +556,5 @@ def _known_scale(workspace: Path, mapping: MappingRecord) -> _KnownScale:
             f"{path} measures an earlier model: remove it, run 'alice-survey reconstruct', and "
             "measure the known length again with 'alice-survey control'"
         )
-    return _KnownScale(
-        scale=measured.metres_per_unit,
-        source="scaled by one known length",
-        sigma=LENGTH_SCALE_SIGMA,
-    )
+    source = "scaled by one known length"
+    return _KnownScale(scale=measured.metres_per_unit, source=source, sigma=LENGTH_SCALE_SIGMA)

@@ -347,6 +347,10 @@ def test_pictures_become_a_report_in_one_command(
         assert ran == [(n, dive) for n in (*names("calibrate", "reconstruct"), "report")]
         assert (dive / "images").is_dir() and not list((tmp_path / "a").glob("*/"))
         ran.clear()
+    monkeypatch.undo()
+    refused = CliRunner().invoke(app, ["reconstruct", str(tmp_path / "a")])
+    assert f"reconstruct {tmp_path / 'a'} -o" in str(refused.exception)
+    monkeypatch.setattr("alice_survey.app.pipeline.run", made)
     for folder, fault in ((tmp_path / "b", WorkspaceError), (dive, ConfigError)):
         refused = CliRunner().invoke(app, ["reconstruct", str(folder), "-o", str(dive)])
         assert isinstance(refused.exception, fault) and not ran
