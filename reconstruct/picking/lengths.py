@@ -27,7 +27,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.contents import read_arrays
-from alice_survey.core.errors import ReconstructionError
+from alice_survey.core.errors import ReconstructionError, offer
 from alice_survey.core.frames import Array
 from alice_survey.core.records import MappingRecord, RegistrationRecord, ScaleRecord
 from alice_survey.kit.words import digits, with_sigma
@@ -465,14 +465,16 @@ def measure(
     marks = parse_picks(points, pick_sigma_px)
     pictures = RegisteredPictures.read(workspace)
     if not pictures.frame.scaled:
-        raise ReconstructionError("the model has no scale: lengths in it are not metres")
+        scale, give = workspace / SCALE_FILE, "control --points ... --length ..."
+        after = offer("reconstruct" if scale.is_file() else give, "-w", workspace)
+        raise ReconstructionError(f"the model has no scale: lengths are not metres; run {after!r}")
     finder = _PickFinder(workspace, pictures)
     picks = [finder.find(some) for some in marks]
     lines: list[PolylineFigure] = [(partial(_segment, n), 1) for n in range(len(picks) - 1)]
     if len(picks) > 2:
         lines += [(polyline, 1), (polygon_area, 2)]
     places, figures = Lengths(workspace, pictures).figures(picks, lines)
-    return _describe(words, places, figures)
+    return _describe(words, places, figures, _scale_sigma(workspace) > 0.0)
 
 
 def scale_model(workspace: Path, points: str, length_m: float) -> str:
@@ -593,7 +595,7 @@ def _segment(number: int, points: Array) -> float:
 
 
 def _describe(
-    words: Sequence[str], places: Array, figures: Sequence[PickedFigure]
+    words: Sequence[str], places: Array, figures: Sequence[PickedFigure], known_scale: bool
 ) -> tuple[str, dict[str, Any]]:
     def entry(figure: PickedFigure, unit: str) -> dict[str, float]:
         return {
@@ -611,7 +613,7 @@ def _describe(
         picks, poses, scale = (digits(1e3 * sigma, 2) for sigma in sigmas)
         lines.append(
             f"{one} to {other}: {_millimetres(figure)} ({picks} of pixels, {poses} of poses, "
-            f"{scale} of calibration)"
+            f"{scale} of {'scale' if known_scale else 'calibration'})"
         )
     data: dict[str, Any] = {
         "format": "alice-survey measure",

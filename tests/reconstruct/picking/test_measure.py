@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -17,6 +18,7 @@ from camera_calib.freedom import POSE
 from camera_calib.rig import Covariance, Rig, write_rig
 from reconstruct.measure.figures import polygon_area, polyline
 from reconstruct.picking.lengths import measure, parse_picks
+from reconstruct.picking.registered import RegisteredPictures
 from reconstruct.pictures.importing import import_images
 from tests.oracles_mesh import SIZE, port_rig, station_pictures, surface_points
 
@@ -85,6 +87,17 @@ def test_lengths_of_one_station_are_as_far_off_as_their_sigmas_say(station: Path
     assert max(one["sigma_of_poses_m"] for one in data["distances"]) == 0.0
     with pytest.raises(ReconstructionError, match="outside"):
         measure(station, "left/a.png:900,4 left/a.png:150,120")
+
+
+def test_without_scale_the_next_command_is_offered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    unscaled = SimpleNamespace(frame=SimpleNamespace(scaled=False))
+    monkeypatch.setattr(RegisteredPictures, "read", lambda _: unscaled)
+    for command in ("control --points", "reconstruct"):
+        with pytest.raises(ReconstructionError, match=f"alice-survey {command}"):
+            measure(tmp_path, "a.png:1,2 a.png:3,4")
+        (tmp_path / "scale.json").write_text("{}")
 
 
 def test_points_of_another_form_are_refused() -> None:
