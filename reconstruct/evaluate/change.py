@@ -21,6 +21,7 @@ from alice_survey.core.frames import Array, Datum
 from alice_survey.core.records import ChangeRecord
 from alice_survey.core.run import progress
 from alice_survey.kit.figure import figure_style, new_figure, save_figure
+from alice_survey.kit.words import count, length
 from reconstruct.elevation import Elevation, elevation_in
 from reconstruct.evaluate.figures import json_number, map_errors, rms
 from reconstruct.evaluate.registration import HeightFit, adjust_heights, register_heights
@@ -431,13 +432,15 @@ def _change_registration(fit: HeightFit, georeferenced: Any) -> dict[str, Any]:
 
 def _change_text(figures: dict[str, Any], folder: Path) -> str:
     still, shift = figures["unchanged"], figures["registration"]["shift_east_north_up_m"]
+    changes = [
+        f"{word} {abs(one['volume_l']):.2f} +/- {one['sigma_l']:.2f} l in "
+        f"{count(one['regions'], 'place')}"
+        for word in ("gained", "lost") if (one := figures[word])["regions"]
+    ] or ["nothing changed surely"]  # fmt: skip
     return "\n".join([
-        f"gained {figures['gained']['volume_l']:.2f} +/- {figures['gained']['sigma_l']:.2f} l in "
-        f"{figures['gained']['regions']} places, lost {-figures['lost']['volume_l']:.2f} +/- "
-        f"{figures['lost']['sigma_l']:.2f} l in {figures['lost']['regions']}, on "
-        f"{figures['changed_m2']:.2f} of {figures['area_m2']:.2f} m2",
-        f"registered by {shift[0]:+.3f} east, {shift[1]:+.3f} north, {shift[2]:+.3f} m up of the "
-        f"georeferences; unchanged ground differs by {still['robust_sigma_mm']:.2f} mm "
+        f"{', '.join(changes)}: {figures['changed_m2']:.2f} of {figures['area_m2']:.2f} m2",
+        f"the two models lay {length(float(np.linalg.norm(shift)))} apart and were laid on each "
+        f"other; unchanged ground differs by {still['robust_sigma_mm']:.2f} mm "
         f"({still['difference_over_sigma_rms']:.2f} of its sigma; "
         f"{still['share_significant']:.1%} of it beyond {SIGNIFICANT} sigma)",
         f"maps in {folder}",

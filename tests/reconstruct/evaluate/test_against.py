@@ -136,7 +136,8 @@ def test_the_command_writes_maps_of_the_figures(tmp_path: Path) -> None:
     datum = Datum(32.8236, 34.9553)
     now = write_survey(tmp_path / "now", survey(10, STILL, MOUND_M), datum)
     before = write_survey(tmp_path / "before", survey(11, AWAY, 0.0), datum)
-    _, figures = evaluate_against(now, before)
+    text, figures = evaluate_against(now, before)
+    assert "-0.00" not in text and "lost" not in text
     assert figures["gained"]["volume_l"] == pytest.approx(1e3 * MOUND_M3, rel=0.05)
     np.testing.assert_allclose(
         figures["registration"]["turn_deg"], np.rad2deg(AWAY.rotation.as_rotvec()), atol=0.02
