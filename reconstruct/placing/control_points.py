@@ -165,7 +165,7 @@ def read_control(path: Path) -> Control:
         WorkspaceError: it cannot be read, or a row is wrong; the message names the line.
     """
     points, lengths = [], []
-    for row, fault in _rows(path, ("kind", "name", "use"), _KNOWN_COLUMNS):
+    for row, fault in _rows(path, ("kind", "name", "use"), (*_KNOWN_COLUMNS, *_GRID)):
         with fault:
             known = _read_known(row)
         if isinstance(known, KnownPoint):
@@ -246,6 +246,7 @@ _POINT_COLUMNS = (
     "latitude_deg", "longitude_deg", "north_m", "east_m", "depth_m", "height_m", "sigma_m",
     "sigma_vertical_m",
 )  # fmt: skip
+_GRID = ("easting_m", "northing_m", "epsg")
 _KNOWN_COLUMNS = ("kind", "name", "use", *_POINT_COLUMNS, "from", "to", "length_m")
 
 
@@ -270,8 +271,7 @@ def write_picks(path: Path, picks: Sequence[Pick]) -> None:
 
 def _point(row: dict[str, str], name: str, use: Use, sigma: float) -> KnownPoint:
     at = {key: read_number(row.get(key, ""), key) for key in _POINT_COLUMNS}
-    grid = ("easting_m", "northing_m", "epsg")
-    easting, northing, epsg = (read_number(row.get(key, ""), key) for key in grid)
+    easting, northing, epsg = (read_number(row.get(key, ""), key) for key in _GRID)
     places = (
         (at["latitude_deg"], at["longitude_deg"]), (at["north_m"], at["east_m"]),
         (easting, northing),
