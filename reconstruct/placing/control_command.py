@@ -564,8 +564,8 @@ def read_foreign(path: Path) -> ForeignControl:
         read = read_gcp_list
     else:
         raise WorkspaceError(
-            f"{path}: neither a gcp_list.txt of ODM (its first line names the coordinate system) "
-            "nor markers that Metashape exported as XML"
+            f"{path}: neither a gcp_list.txt of ODM (first its coordinate system) nor markers that "
+            "Metashape exported; a plain table is WORKSPACE/control.csv (see docs/formats.md)"
         )
     try:
         found = read(text)

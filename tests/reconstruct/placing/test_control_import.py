@@ -199,7 +199,7 @@ def test_pictures_of_a_rig_are_told_apart_by_their_folder(tmp_path: Path) -> Non
             "line 3: point A has another",
         ),
         ("EPSG:4326\n-91 46 nan 10 20 DJI_1.jpg A\n", "no point has a place"),
-        ("easting northing\n1 2\n", "neither a gcp_list.txt"),
+        ("easting northing\n1 2\n", "neither a gcp_list.txt.*control.csv"),
         ("<document><chunk><markers></chunk>", "not valid XML"),
         ('<!DOCTYPE x [<!ENTITY a "b">]><document><markers/></document>', "DOCTYPE"),
         ("<document><chunk><markers/></chunk></document>", "no coordinate system"),
