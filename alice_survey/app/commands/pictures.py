@@ -382,7 +382,7 @@ class ControlCommand(WorkspaceCommand, ThreadsCommand, ReportCommand):
 class QualityCommand(WorkspaceCommand, ThreadsCommand, ReportCommand):
     """Judge the pictures.
 
-    Sharpness, exposure, turbidity and overlap of each; the bad ones by name, with the reason.
+    Sharpness, exposure and turbidity of each; the bad ones by name, with the reason.
     """
 
     name = "quality"
