@@ -30,7 +30,7 @@ _AFTER = re.compile(
 )
 _GAP = '<mspace width="0.17em" />'
 _BAR = re.compile(r'<mo(?: stretchy="false")?>(&#x02016;|&#x0007C;)</mo>')
-_TABLE = re.compile(r"<!-- ([\w ]+): made when the site is built -->(?:\nUntil the site is built: .*)?")
+_TABLE = re.compile(r"<!-- ([\w ]+): made when the site is built -->(?:\nUntil the site .*)?")
 _OPTION_HEAD = ["| option | value | default | what |", "|---|---|---|---|"]
 _SETTING_HEAD = ["| setting | default | range | what |", "|---|---|---|---|"]
 _PARTS = re.compile(
