@@ -272,13 +272,17 @@ def _site(
 
 
 def _home(given: tuple[float, float] | None, area: Area) -> tuple[float, float]:
-    """Where dives begin and end: as set, or the area's corner nearest the datum, or close to it.
+    """Where dives begin and end: as set, or at or near the area's corner nearest the datum.
+
+    Corners at zones to keep out of count only where there are no others.
 
     Raises:
         PlanError: it is not where the vehicle may be.
     """
     if given is None:
         corners = area.corners_ne
+        at_zone = shapely.distance(shapely.points(corners), area.no_go) <= 1e-6
+        corners = corners[at_zone == at_zone.all()]
         # Of corners as far from the datum the most southerly, then the most westerly.
         distance = np.round(np.hypot(corners[:, 0], corners[:, 1]), 6)
         rank = np.lexsort((corners[:, 1], corners[:, 0], distance))

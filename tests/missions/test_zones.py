@@ -9,16 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
-from shapely.geometry import Point, Polygon, box
+from shapely.geometry import MultiPolygon, Point, Polygon, box
 from shapely.geometry.base import BaseGeometry
 
 from alice_survey.core.config import SurveyConfig
-from alice_survey.core.frames import Array
+from alice_survey.core.frames import Array, Datum
 from alice_survey.sim.vehicle.vehicle import vehicle_from
 from missions.exports.format import options_of
 from missions.exports.write import write_exports
 from missions.fly.simulation import flight_settings, simulate_mission
-from missions.plan.planner import Planned
+from missions.plan.planner import Planned, _home
+from missions.values.area import Area, multipolygon
 from missions.values.legs import Leg
 from missions.values.plan_file import Plan
 from tests.missions.exports.plans import RIG
@@ -103,6 +104,16 @@ def test_turns_and_ways_keep_the_hull_out_of_zones(zones: tuple[Polygon, ...]) -
     assert found.plan.coverage > 0.999
     assert any(abs(leg.side_rad) == math.pi for leg in found.plan.dives[0].route.legs)
     assert ways_over(found) == [] and any("hull" in text for text in found.warnings)
+
+
+def test_home_is_no_corner_of_a_zone_while_there_are_others() -> None:
+    """The datum is in the middle of an area, next to a wreck; another zone cuts its edge."""
+    outer, zones = box(-9, -9, 9, 9), MultiPolygon([box(1, 1, 2, 2), box(-9, -1, -5, 1)])
+    allowed = multipolygon(outer.difference(zones))
+    for shape, home in ((allowed, (-9, -9)), (box(2, 1, 4, 2), (4, 1)), (box(1, 1, 2, 2), (1, 1))):
+        survey = multipolygon(shape)
+        area = Area(datum=Datum(32.8, 35.0), survey=survey, allowed=allowed, no_go=zones)
+        assert _home(None, area) == home
 
 
 def test_where_there_is_no_room_to_turn_one_line_counts_the_ways() -> None:
