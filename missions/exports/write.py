@@ -234,11 +234,15 @@ def _config_of_plan(path: Path) -> SurveyConfig:
         for key in ("camera", "water", "plan", "vehicle", "sea")
         if isinstance(settings.get(key), dict)
     }
-    if not {"camera", "water"} <= known.keys():
+    if stage is None or not {"camera", "water"} <= known.keys():
         raise PlanError(
             f"{path}: is not in a finished plan folder, so that where the camera sits on the "
             "vehicle is not known: give the survey's settings too"
         )
+    # Settings name files alone, inputs by their way from the workspace.
+    files = {Path(file).name: str(path.parent / ".." / file) for file in stage.inputs}
+    vehicle = known.get("vehicle", {}).items()
+    known["vehicle"] = {key: files.get(str(value), value) for key, value in vehicle}
     return parse_config(known, str(path.parent))
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from alice_survey.core.artefacts import read_csv, write_json
-from alice_survey.core.config import parse_config
+from alice_survey.core.config import VehicleConfig, parse_config
 from alice_survey.core.errors import PlanError
 from missions.exports import formats
 from missions.exports.geometry import CameraMount
@@ -29,6 +29,7 @@ from missions.values.plan_file import Plan
 from tests.missions.areas.sites import floor_of
 from tests.missions.exports.plans import RIG, line, plan_of, small_plan
 from tests.missions.exports.readers import local_ne
+from tests.missions.test_own_vehicle import HEAVY
 
 
 def rows(path: Path) -> list[dict[str, str]]:
@@ -95,7 +96,10 @@ def test_the_report_takes_the_mount_from_the_settings_of_the_plan(tmp_path: Path
 
     config = parse_config({"camera": {"position_body_m": [0.7, -0.1, 0.05]}}, "test")
     settings = {name: getattr(config, name).model_dump(mode="json") for name in ("camera", "water")}
-    write_json(folder / "stage.json", {"settings": settings})
+    settings["vehicle"] = VehicleConfig(name="own.toml").model_dump(mode="json")
+    (tmp_path / "own.toml").write_bytes(HEAVY.read_bytes())
+    entry = [1, 1, ""]  # files are known by their names, and by their way from the workspace
+    write_json(folder / "stage.json", {"settings": settings, "inputs": {"own.toml": entry}})
     text, about = export_report(folder / "plan.json", ["wpl", "csv"])
     given, _ = export_report(folder, ["wpl", "csv"], tmp_path / "other")
 
