@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from alice_survey.core.errors import VehicleError, extra
+from alice_survey.core.errors import VehicleError, extra, note
 from alice_survey.core.frames import Array, Datum, rotation_from_attitude
 from alice_survey.sim.vehicle import estimate_vector as vector
 from alice_survey.sim.vehicle.simulator import TICK_S
@@ -66,6 +66,7 @@ def pilot_over_mavlink(mission: LiveMission, address: str, *, sim_time: bool) ->
     link = mavlink_to(address, source_component=_ONBOARD_COMPUTER)
     pilot = MavlinkPilot(mission, link.mav, sim_time=sim_time)
     heard, max_s = time.monotonic(), FIRST_S
+    note(f"waits for a heartbeat of the autopilot on {address}")
     try:
         while mission.loop.state != LinkState.OVER:
             message = link.recv_match(blocking=True, timeout=_WAIT_S)

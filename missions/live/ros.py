@@ -257,6 +257,7 @@ def pilot_over_ros(mission: LiveMission, topics: Topics, *, sim_time: bool) -> N
     """
     with _session() as ros:
         node = PilotNode(ros, mission, topics, sim_time)
+        note(f"waits for ROS 2 odometry on {node.node.resolve_topic_name(topics.odometry)}")
         try:
             while mission.loop.state != LinkState.OVER:
                 ros.rclpy.spin_once(node.node, timeout_sec=_WAIT_S)

@@ -13,9 +13,15 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from alice_survey.core.artefacts import read_csv
 from alice_survey.core.config import SurveyConfig
-from alice_survey.core.errors import VehicleError
+from alice_survey.core.errors import VehicleError, collected_by
 from missions.fly.simulation import flight_settings
-from missions.live.mavlink_pilot import GUIDED, SURFACE, MavlinkPilot, mavlink_to
+from missions.live.mavlink_pilot import (
+    GUIDED,
+    SURFACE,
+    MavlinkPilot,
+    mavlink_to,
+    pilot_over_mavlink,
+)
 from missions.live.mission import LinkLimits, LinkState, mission_of
 from tests.missions.live.flights import FLOOR_M, pictures_of, small_plan, workspace_in
 
@@ -179,6 +185,15 @@ def test_a_serial_port_without_its_library_names_what_to_install(
     monkeypatch.setitem(sys.modules, "serial", None)
     with pytest.raises(VehicleError, match=r"pip install .*pymavlink"):
         mavlink_to("/dev/ttyACM0,115200")
+
+
+def test_what_it_waits_for_is_noted_at_once() -> None:
+    notes: list[str] = []
+    mission = Vehicle().mission
+    mission.loop.end("over before it begins")
+    with collected_by(lambda level, text: notes.append(text)):
+        pilot_over_mavlink(mission, "udpin:127.0.0.1:0", sim_time=False)
+    assert len(notes) == 1 and "udpin:127.0.0.1:0" in notes[0]
 
 
 def test_vehicle_without_an_origin_is_given_the_datum() -> None:
