@@ -18,7 +18,7 @@ from pydantic import (
 )
 from pydantic.config import JsonDict
 
-from alice_survey.core.contents import as_line, one_line, ordinary_file, parse_toml
+from alice_survey.core.contents import as_line, nearest, one_line, ordinary_file, parse_toml
 from alice_survey.core.errors import ConfigError, offer, why
 from alice_survey.core.seawater import GREEN_NM, n_water, n_water_sigma
 
@@ -953,12 +953,7 @@ def _one_line(error: ValidationError) -> str:
 
 
 def _nearest(*location: str) -> str:
-    import difflib
-
     section: Any = SurveyConfig
     for name in location[:-1]:
         section = section.model_fields[name].annotation
-    close = difflib.get_close_matches(location[-1], section.model_fields, n=1)
-    return (
-        f"; did you mean {close[0]}?" if close else f"; known are {', '.join(section.model_fields)}"
-    )
+    return nearest(location[-1], section.model_fields)

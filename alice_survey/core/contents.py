@@ -9,7 +9,7 @@ import struct
 import tomllib
 import zipfile
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree as ET
@@ -151,16 +151,19 @@ def in_workspace(path: str | Path, within: str) -> Path:
     return inner if path.is_dir() and (inner.suffix or inner.exists()) else path
 
 
-def first_fault(error: "ValidationError", whole: str = "") -> str:
+def first_fault(error: "ValidationError", whole: str = "", known: Collection[str] = ()) -> str:
     """The first value that a model refuses, and why, on one line.
 
     Args:
         error: of pydantic.
         whole: what the values are called together, where none of them is named.
+        known: names that values may have.
     """
     first = error.errors(include_url=False)[0]
     where = ".".join(map(str, first["loc"])) or whole
     text = as_line(first["msg"].removeprefix("Value error, "))
+    if known and first["type"] == "extra_forbidden" and len(first["loc"]) == 1:
+        text += nearest(where, known)
     return f"{where}: {text}" if where else text
 
 
@@ -168,6 +171,14 @@ def as_line(text: str) -> str:
     """External text made safe for a message: one line, printable, of limited length."""
     plain = " ".join("".join(c if c.isprintable() else " " for c in text).split())
     return plain if len(plain) <= _SHOWN else f"{plain[: _SHOWN - 3]}..."
+
+
+def nearest(name: str, known: Collection[str]) -> str:
+    """The end of a message on a name that is not known: the closest of those that are, or all."""
+    import difflib
+
+    close = difflib.get_close_matches(name, known, n=1)
+    return f"; did you mean {close[0]}?" if close else f"; known are {', '.join(known)}"
 
 
 _MAX_MEMBERS = 1000

@@ -87,9 +87,7 @@ def write_exports(
 def _write_sums(folder: Path, files: Iterable[Path]) -> None:
     """Write the digests of files, and keep those of others that are still there."""
     sums = {name: old for name, old in _sums(folder).items() if (folder / name).is_file()}
-    for file in files:
-        if file.name != SUMS:
-            sums[file.name] = hashlib.sha256(file.read_bytes()).hexdigest()
+    sums |= {f.name: hashlib.sha256(f.read_bytes()).hexdigest() for f in files if f.name != SUMS}
     with atomic_path(folder / SUMS) as path:
         path.write_text("".join(f"{sums[name]}  {name}\n" for name in sorted(sums)))
 
@@ -229,11 +227,8 @@ def _config_of_plan(path: Path) -> SurveyConfig:
     """Camera, water, limits, vehicle and sea that a plan was made with."""
     stage = read_stage(path.parent)
     settings = {} if stage is None else stage.settings
-    known = {
-        key: settings[key]
-        for key in ("camera", "water", "plan", "vehicle", "sea")
-        if isinstance(settings.get(key), dict)
-    }
+    names = ("camera", "water", "plan", "vehicle", "sea")
+    known = {name: settings[name] for name in names if isinstance(settings.get(name), dict)}
     if stage is None or not {"camera", "water"} <= known.keys():
         raise PlanError(
             f"{path}: is not in a finished plan folder, so that where the camera sits on the "

@@ -21,7 +21,7 @@ def call(command: str, **options: Any) -> Any:
 
     Args:
         command: its words after `alice-survey`, such as `measure` or `plan check`.
-        options: as its help names them, with `_` for `-`, and its arguments.
+        options: as its help names them, with `_` for `-`, and its arguments; a list of several.
 
     Returns:
         What it prints with `--json`; None of a command that has no such option.
@@ -45,10 +45,14 @@ def call(command: str, **options: Any) -> Any:
         raise ConfigError(f"there is no command {command!r}: one of {', '.join(sorted(kinds))}")
     kind = kinds[command]
     fields = {kind.option_name(one)[2:].replace("-", "_"): one for one in kind.model_fields}
+    given = {fields.get(name, name): value for name, value in options.items()}
+    many = {name for name, one in kind.model_fields.items() if "list[" in str(one.annotation)}
+    for name in many & {one for one in given if isinstance(given[one], str | float | int | Path)}:
+        given[name] = [given[name]]
     try:
-        result = kind(**{fields.get(name, name): value for name, value in options.items()}).run()
+        result = kind(**given).run()
     except ValidationError as error:
-        raise ConfigError(f"{command}: {first_fault(error)}") from None
+        raise ConfigError(f"{command}: {first_fault(error, known=fields)}") from None
     except typer.BadParameter as error:
         raise ConfigError(f"{command}: {error.message}") from None
     return None if result is None else result[1]

@@ -49,7 +49,7 @@ def argument(default: Any, text: str, metavar: str | None = None) -> Any:
     return Field(default, description=text, json_schema_extra=extra)
 
 
-class CommandModel(BaseModel):
+class CommandModel(BaseModel, coerce_numbers_to_str=True):
     """A command and its arguments."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, defer_build=True)

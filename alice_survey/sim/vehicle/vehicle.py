@@ -24,7 +24,7 @@ from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError
 
 from alice_survey.core.artefacts import write_json
 from alice_survey.core.config import VEHICLE_FILES, Config
-from alice_survey.core.contents import as_line, one_line, ordinary_file, parse_toml
+from alice_survey.core.contents import as_line, first_fault, one_line, ordinary_file, parse_toml
 from alice_survey.core.errors import VehicleError, file_faults
 from alice_survey.core.frames import Array
 from alice_survey.sim.vehicle.coefficients import (
@@ -265,8 +265,6 @@ _MERIT = 0.07 / 0.4566**1.5
 in water at rest (k_t 0.4566, k_q 0.0700; T. I. Fossen's MSS toolbox, remus100): 0.227. Where no
 torque of a propeller is known: inferred to be as good as that one, both ways. Momentum theory asks
 for 0.090 at least; Stonefish's k_q of 0.01 for a k_t of 0.698 is 0.017."""
-_MAX_FAULTS = 3
-"""Faults of a file that one message names."""
 _NEEDED_FOR_SPEEDS = ("diameter_m", "kt_forward", "kt_reverse", "time_constant_s")
 _NEEDED_TO_FLY = (*_NEEDED_FOR_SPEEDS, "most_rps")
 
@@ -497,8 +495,5 @@ def parse_table(path: Path | str, kind: type[_Kind], table: object) -> _Kind:
     try:
         return TypeAdapter(kind).validate_python(table)
     except ValidationError as error:
-        faults = [
-            f"{as_line('.'.join(map(str, fault['loc']))) or 'the table'}: {fault['msg']}"
-            for fault in error.errors()[:_MAX_FAULTS]
-        ]
-        raise VehicleError(f"{path}: {'; '.join(faults)}") from None
+        fault = first_fault(error, "the table", getattr(kind, "model_fields", ()))
+        raise VehicleError(f"{path}: {fault}") from None

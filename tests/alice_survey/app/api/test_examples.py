@@ -117,8 +117,14 @@ def test_commands_take_the_names_of_their_help_and_readers_a_workspace(tmp_path:
         "fov", survey=tmp_path / "survey.toml", altitude=[1.5], csv=tmp_path / "a.csv"
     )
     assert shown == alice.call("fov", altitude=[1.5], survey=tmp_path / "survey.toml")
-    for name, option in (("none", "json"), ("fov", "lenz"), ("report", "threads")):
-        with pytest.raises(alice.AliceError):
+    assert shown == alice.call("fov", altitude=1.5, survey=tmp_path / "survey.toml")
+    with pytest.raises(alice.AliceError, match="pictures"):  # not that a glass is text
+        alice.call("calibrate", glass=10)
+    for name, option, near in (
+        ("none", "json", ""), ("fov", "lenz", "lens"), ("report", "threads", ""),
+        ("fov", "altitud", "altitude"),
+    ):  # fmt: skip
+        with pytest.raises(alice.AliceError, match=rf"{near}\b"):
             alice.call(name, **{option: "three"})
     plan = reef.plan()
     assert alice.read_plan(tmp_path) == alice.read_plan(tmp_path / "plan" / "plan.json") == plan
