@@ -27,7 +27,7 @@ def plot_plan(plan: Plan) -> Sheet:
     """Draw the area, the survey lines and home of a plan, east to the right.
 
     Args:
-        plan: the survey's plan.
+        plan: the survey's plan, such as `Survey.plan()` or `read_plan(folder)`; no folder.
 
     Example:
         >>> import alice_survey as alice
@@ -51,7 +51,7 @@ def plot_dem(dem: Dem) -> Sheet:
     """Draw heights and their standard deviations next to each other.
 
     Args:
-        dem: the surface.
+        dem: the surface, such as `Survey.dem` or `read_dem(folder)`; no folder.
 
     Example:
         >>> import alice_survey as alice
@@ -80,7 +80,7 @@ def plot_mosaic(mosaic: Mosaic) -> Sheet:
     """Draw the mosaic with its coordinates and a scale bar.
 
     Args:
-        mosaic: the survey's mosaic.
+        mosaic: the survey's mosaic, such as `Survey.mosaic` or `read_mosaic(folder)`; no folder.
 
     Example:
         >>> import alice_survey as alice
@@ -97,7 +97,7 @@ def plot_track(track: Track) -> Sheet:
     """Draw where pictures were taken, coloured by the standard deviation of their position.
 
     Args:
-        track: the survey's camera track.
+        track: the survey's camera track, such as `Survey.track` or `read_track(folder)`; no folder.
 
     Example:
         >>> import alice_survey as alice

@@ -128,6 +128,8 @@ class Survey:
         """
         from missions.plan.preview import draft_settings
 
+        if lost := [name for name, one in sections.items() if not isinstance(one, Mapping)]:
+            raise ConfigError(f'{lost[0]} is not a section: give one, as plan={{"altitude_m": 2}}')
         path = self.folder / "survey.toml"
         with file_faults(path, ConfigError):
             text = path.read_bytes().decode()

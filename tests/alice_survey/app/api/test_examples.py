@@ -112,6 +112,8 @@ def test_commands_take_the_names_of_their_help_and_readers_a_workspace(tmp_path:
     assert reef.config.plan.altitude_m == 1.5 and len(repr(reef.config)) < 800
     with pytest.raises(alice.AliceError, match="altitude_m"):
         reef.with_settings(plan={"altitude_m": -1})
+    with pytest.raises(alice.AliceError, match="plan="):
+        reef.with_settings(altitude_m=2)  # type: ignore[arg-type]
     assert "altitude_m = 1.5" in (tmp_path / "survey.toml").read_text(encoding="utf-8")
     shown = alice.call(
         "fov", survey=tmp_path / "survey.toml", altitude=[1.5], csv=tmp_path / "a.csv"
