@@ -38,7 +38,7 @@ BOUNDS = {
     "modules with a single importer": 70,
     "kernels": 238,
     "commands": 36,
-    "options of commands": 350,
+    "options of commands": 349,
     "settings": 125,
     "functions that take the whole SurveyConfig": 14,
     "layers of the import contract": 8,

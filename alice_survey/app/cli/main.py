@@ -72,7 +72,6 @@ class StudioCommand(WorkspaceCommand):
         "studio -w reef --port 8000 --no-browser",
     )
     port: int = option(0, "To listen on; 0 for any that is free.", ge=0, le=65535)
-    background: str | None = option(None, "No longer used.", metavar="URL")
     browser: bool = option(True, "Open the page in a browser.", "--browser/--no-browser")
     log: str | None = option(
         None, "Navigation CSV of a dive to follow, which grows.", metavar="LOG"
@@ -82,8 +81,6 @@ class StudioCommand(WorkspaceCommand):
         """Serve it."""
         from alice_survey.app.studio.server import run_studio
 
-        if self.background is not None:
-            note("--background: a base map is chosen in the page, under Layers")
         run_studio(self.workspace, self.port, browser=self.browser, show=typer.echo, log=self.log)
 
 
