@@ -366,6 +366,8 @@ def read_navigation(
     columns = {name: cells[:, i] for i, name in enumerate(names)}
     if HEIGHT in columns:
         columns["depth_m"] = -columns.pop(HEIGHT)
+    elif np.fmax.reduce(columns.get("depth_m", np.zeros(1)), initial=np.nan) < 0:
+        warn(f"{path}: all depths are negative: depths are positive down")
     if not any(np.isfinite(columns[name]).any() for name in READINGS if name in columns):
         what = "a position" if needed else "a reading"
         raise NavigationError(f"{path}: no row with a time and {what}")

@@ -227,7 +227,7 @@ class ExportCommand(WorkspaceCommand, ReportCommand):
     title = "Write the plan for vehicles"
     offered = ("formats",)
     formats: list[str] | None = option(
-        None, f"{', '.join(format_names())}; all if none.", "--format"
+        None, f"{', '.join(format_names())}; all if none. ArduSub takes wpl and qgc.", "--format"
     )
     camera_on: str | None = option(None, "COLA2's service that starts pictures.")
     camera_off: str | None = option(None, "COLA2's service that stops them.")

@@ -102,9 +102,9 @@ def _fence(export: Export, *, first: bool) -> list[dict[str, Any]]:
         fences += [_polygon(plan, part, inclusion=False) for part in parts]
     if crossed and first:
         warn(
-            f"lines bring the vehicle's reference point, {export.mount.reach_m:.2f} m from the "
-            f"glass, over {crossed} of {len(zones)} no-go zones: the fence leaves it the way, and "
-            f"leaves out {lost or 'none'} of them; raise area.no_go_clearance_m to keep them whole"
+            f"the QGroundControl fence excludes {crossed} of {len(zones)} no-go zones only in part"
+            f"{f', {lost} of them not at all' if lost else ''}, since lines bring the vehicle's "
+            "reference point over them: raise area.no_go_clearance_m to exclude them whole"
         )
     return fences
 

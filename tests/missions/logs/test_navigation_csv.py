@@ -6,7 +6,7 @@ from zoneinfo import ZoneInfo
 import numpy as np
 import pytest
 
-from alice_survey.core.errors import NavigationError
+from alice_survey.core.errors import NavigationError, keep_warnings
 from missions.logs.navigation_csv import find_zone, read_navigation, warn_of_gaps
 from tests.refusals import refused
 
@@ -85,6 +85,16 @@ def test_rows_of_one_fault_are_counted(tmp_path: Path, capsys: pytest.CaptureFix
     assert [part.split(":")[0] for part in parts] == [
         "3 lines from 7 on", "40 lines from 12 on", "line 62",
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize(("depths", "said"), [("-4.0 -3.5", 1), ("-4.0 ", 1), ("-0.1 3.5", 0)])
+def test_depths_that_are_heights_are_noticed(tmp_path: Path, depths: str, said: int) -> None:
+    path = tmp_path / "log.csv"
+    rows = (f"{i},32.8,35.0,{one}" for i, one in enumerate(depths.split(" ")))
+    path.write_text("\n".join(["time_s,latitude_deg,longitude_deg,depth_m", *rows, ""]))
+    with keep_warnings() as warnings:
+        read_navigation(path, UTC, ())
+    assert len(warnings) == said
 
 
 def test_dates_obey_their_own_zone_else_the_one_given(tmp_path: Path) -> None:
