@@ -5,12 +5,15 @@ import doctest
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform
 
 import alice_survey as alice
+from alice_survey.app.commands.pictures import MeasureCommand
+from alice_survey.app.commands.survey import ReportPageCommand
 from reconstruct.views.model import WorldFrame
 from tests.alice_survey.app.report.tiny import write_raster
 
@@ -131,6 +134,18 @@ def test_commands_take_the_names_of_their_help_and_readers_a_workspace(tmp_path:
     plan = reef.plan()
     assert alice.read_plan(tmp_path) == alice.read_plan(tmp_path / "plan" / "plan.json") == plan
     assert len(repr(plan)) < 100
+
+
+def test_the_calls_of_the_page_are_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What needs a model is taken as given; its keys are those that the commands' tests read."""
+    page = (Path(__file__).parents[4] / "docs/api/survey.md").read_text(encoding="utf-8")
+    length = {"distances": [{"value_m": 1.0, "sigma_m": 0.001}]}
+    monkeypatch.setattr(MeasureCommand, "run", lambda command: ("", length))
+    report = {"report": {"summary": {}}}
+    monkeypatch.setattr(ReportPageCommand, "run", lambda command: ("", report))
+    given: dict[str, Any] = {"alice": alice}
+    exec(page.split("```python")[1].split("```")[0], given)  # noqa: S102
+    assert [row["altitude_m"] for row in given["table"]] == [1.5, 2.0]
 
 
 def test_a_track_is_a_table() -> None:
