@@ -215,7 +215,8 @@ def align_coarser(
         # the halves' first pixel is centred on that of the whole
         scale = 2.0**level
         start, guess = ((p[open_] - 0.5) / scale + 0.5 for p in (reference, pixels))
-        moved = align_patches(first, second, start, guess, affine[open_], scale * bend[open_])
+        places = map(np.ascontiguousarray, (start, guess, affine[open_], scale * bend[open_]))
+        moved = align_patches(first, second, *places)
         found[open_] = (moved - 0.5) * scale + 0.5
     return found
 
