@@ -33,7 +33,7 @@ BOUNDS = {
     "code lines of the packages": 71_436,  # 69,438, and a part of the reserve of 2,000
     "code lines of the tests": 51_924,  # 48,310, and a part of the reserve of 4,000
     "code lines of the benchmarks": 7_973,
-    "lines of our own JavaScript": 4_898,
+    "lines of our own JavaScript": 4_897,
     "modules": 393,
     "modules with a single importer": 70,
     "kernels": 238,

@@ -43,7 +43,7 @@ function startMap(data, root) {
   /* Take a layer, instead of another of its name. */
   function put(about) {
     remove(about.name);
-    const pane = about.under ? "under" : about.base ? "pictures" : "over";
+    const pane = about.base ? "pictures" : "over";
     const layer = about.kind === "picture" ? new Pyramid(about, pane) : shapesOf(about);
     layers.set(about.name, layer);
     return layer;

@@ -11,7 +11,7 @@ const WINDS = ["north", "north-east", "east", "south-east", "south", "south-west
    it is seen from, `lost` is called when the browser takes its graphics memory back. Returns
    `pick`, which gives what is under a pixel of the canvas, with its `point`, or null, `mark`,
    which shows some points and the lines between, and `show`, which draws another model, in the
-   same axes, that is brought up to date before each frame, or the first one again; `dress` makes
+   same axes, that is brought up to date before each frame; `dress` makes
    a model ready for it, `forget` gives its memory back. */
 async function startMesh(root, canvas, bytes, {told, lost}) {
   const view = canvas.parentElement;
@@ -32,7 +32,6 @@ async function startMesh(root, canvas, bytes, {told, lost}) {
   let isRelief = false;
   const grey = new three.MeshLambertMaterial({color: 0xc9c4b8, side: 2});
   let current = {group: model, update() {}, moved() {}};
-  const first = current;
   dress(model);
 
   function dress(some) {
@@ -57,7 +56,7 @@ async function startMesh(root, canvas, bytes, {told, lost}) {
 
   function show(other) {
     scene.remove(current.group);
-    current = other || first;
+    current = other;
     scene.add(current.group);
     draw();
   }

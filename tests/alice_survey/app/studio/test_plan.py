@@ -92,9 +92,9 @@ def assert_planned_as_by_command(workspace: Path, elsewhere: Path) -> None:
 def test_a_saved_plan_is_the_command_lines(
     workspace: Path, server: Server, tmp_path: Path, edit: str
 ) -> None:
+    before = (workspace / "survey.toml").read_bytes()
     shown = post(server, "preview", EDITS[edit])
     assert shown["ok"], shown
-    before = (workspace / "survey.toml").read_bytes()
     assert (workspace / "survey.toml").read_bytes() == before
     assert not (workspace / "plan").exists()
 
