@@ -152,14 +152,15 @@ def in_workspace(path: str | Path, within: str) -> Path:
 
 
 def first_fault(error: "ValidationError", whole: str = "", known: Collection[str] = ()) -> str:
-    """The first value that a model refuses, and why, on one line.
+    """The first value that a model refuses, and why, on one line; a name not known goes before all.
 
     Args:
         error: of pydantic.
         whole: what the values are called together, where none of them is named.
         known: names that values may have.
     """
-    first = error.errors(include_url=False)[0]
+    faults = error.errors(include_url=False)
+    first = min(faults, key=lambda fault: fault["type"] != "extra_forbidden")
     where = ".".join(map(str, first["loc"])) or whole
     text = as_line(first["msg"].removeprefix("Value error, "))
     if known and first["type"] == "extra_forbidden" and len(first["loc"]) == 1:

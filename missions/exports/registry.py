@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from missions.values.mission import Mission
 
 _MAX_BYTES = 64_000_000
-_REMOVED = {"cola2-v1": "cola2", "qgc-survey": "qgc"}
 
 
 def format_names() -> list[str]:
@@ -33,8 +32,6 @@ def format_named(name: str) -> "ExportFormat":
     Raises:
         PlanError: there is none of this name.
     """
-    if name in _REMOVED:
-        raise PlanError(f"format {name!r} is no longer written: use {_REMOVED[name]!r}")
     if name not in format_names():
         raise PlanError(f"format {name!r} is not known; known are {', '.join(format_names())}")
     module = import_module(f"{formats.__name__}.{name.replace('-', '_')}")
