@@ -40,11 +40,13 @@ def _fly_summary(folder: Path) -> Summary:
         f"{mission.line_ends_overshot} of {mission.line_ends} line ends overshot)"
     )
     text = (
-        f"{flight.vehicle} with {how}: {flight.ending}, {flight.stations} of "
-        f"{flight.stations_planned} stations in {flight.duration_s / 60:.0f} min; on lines "
+        f"{flight.vehicle} with {how}: {flight.ending}, {count(flight.stations, 'station')} "
+        f"({flight.stations_planned} planned) in {flight.duration_s / 60:.0f} min; on lines "
         f"{_metres(line.cross_track_rms_m)} cross-track rms (the control's part "
-        f"{_metres(line.believed_cross_track_rms_m)}), heading {_degrees(line.heading_rms_deg)} "
-        f"rms; roll in turns to {_degrees(flight.in_turns.roll_worst_deg)}; "
+        f"{_metres(line.believed_cross_track_rms_m)}; {_metres(line.cross_track_worst_m)} at most, "
+        f"of {_metres(flight.allowed_cross_track_m)} allowed), heading "
+        f"{_degrees(line.heading_rms_deg)} rms; roll in turns to "
+        f"{_degrees(flight.in_turns.roll_worst_deg)}; "
         f"{_metres(flight.min_clearance_m)} above the sea floor at least; "
         f"{sum(flight.energy_wh.values()):.1f} Wh; "
         f"{share(flight.coverage.share_at_overlap)} of the area covered as requested{promised}, "

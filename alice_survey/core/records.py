@@ -47,6 +47,7 @@ class OnLines(JsonRecord):
     """How well a vehicle kept to its lines."""
 
     cross_track_rms_m: float | None
+    cross_track_worst_m: float | None = None
     believed_cross_track_rms_m: float | None
     heading_rms_deg: float | None
 

@@ -101,26 +101,17 @@ def cola2_delta_m(gains: Gains, speed_mps: float) -> float:
     return math.ceil(10.0 * min_look_ahead_m(gains, speed_mps, 0.0) - 1e-6) / 10.0
 
 
-def line_offset_m(
-    follower: Follower, heading_rad: float, speed_mps: float, lever_m: float
-) -> float:
-    """How far to starboard of a line COLA2 holds the glass in the expected current, in the end.
+def off_lines_m(follower: Follower, plan: Plan, lever_m: float) -> Array:
+    """How far off each of a plan's lines, (L,), COLA2 holds the glass in current and gusts.
 
     The reference point is down the current; the glass, ahead of it, is nearer to the line, since
     the vehicle heads into the current.
 
     Args:
         follower: vehicle and current.
-        heading_rad: course of the line.
-        speed_mps: of the plan.
+        plan: its lines.
         lever_m: how far the glass is ahead of the reference point.
     """
-    across = follower.across_mps(heading_rad)
-    return math.copysign(steady_drift(across, speed_mps) * (follower.delta_m - lever_m), across)
-
-
-def off_lines_m(follower: Follower, plan: Plan, lever_m: float) -> Array:
-    """How far off each of a plan's lines, (L,), COLA2 holds the glass in current and gusts."""
     across = (abs(follower.across_mps(line.heading_rad)) for line in plan.lines)
     drift = [steady_drift(mps + follower.gust_mps, plan.speed_mps) for mps in across]
     return (follower.delta_m - lever_m) * np.array(drift)

@@ -14,7 +14,7 @@ from alice_survey.core.run import progress
 from alice_survey.kit.words import count
 from alice_survey.sim.vehicle.pilot.mission import MIN_RADIUS_M, MIN_SPEED_MPS, Cola2Settings
 from camera_calib.rig import Rig, design_rig
-from missions.exports.follower import cola2_settings, expected_m, line_offset_m
+from missions.exports.follower import cola2_settings, expected_m, off_lines_m
 from missions.exports.format import Export, ExportFormat, Options, line_tolerance_m, options_of
 from missions.exports.registry import format_named, format_names, read_mission
 from missions.values.plan_file import Plan, read_plan
@@ -254,26 +254,28 @@ def _cola2(export: Export, files: Iterable[Path], *, chosen: bool) -> list[str]:
         return [f"COLA2: no section/delta keeps {follower.name} from weaving: lower the speed."]
     own, default = cola2_settings(follower.delta_m, plan.speed_mps), Cola2Settings()
     lever_m, allowed_m = export.mount.glass_body_m[0], plan.allowed_offset_m
-    offsets = [
-        abs(line_offset_m(follower, line.heading_rad, plan.speed_mps, lever_m))
-        for line in plan.lines
-        if line.kind in ("survey", "fill")
-    ]
-    offset_m = max(offsets, default=0.0)
     flown = [
         expected_m(follower, plan, lever_m, read_mission(path))
         for path in files
         if path.suffix == ".xml"
     ]
-    off_m = max((off_m.max() for off_m, _ in flown), default=0.0)
+    start_m = max((off_m.max() for off_m, _ in flown), default=0.0)
     outside_m = max((outside_m for _, outside_m in flown), default=0.0)
     expected = (
-        f"in the expected current of {follower.current_mps:g} m/s COLA2 holds {follower.name} up "
-        f"to {offset_m:.2f} m off lines {plan.line_spacing_m:.2f} m apart, which allow "
-        f"{allowed_m:.2f} m, and up to {off_m:.2f} m in gusts and where lines begin"
+        f"in the expected current of {follower.current_mps:g} m/s and its gusts COLA2 keeps "
+        f"{follower.name} within {off_lines_m(follower, plan, lever_m).max():.2f} m of lines "
+        f"{plan.line_spacing_m:.2f} m apart, which allow {allowed_m:.2f} m, and about "
+        f"{start_m:.2f} m where lines begin"
     )
+    if outside_m >= 0.005:
+        expected += f"; in turns it leaves the allowed area by up to {outside_m:.2f} m"
+    steady_m = off_lines_m(replace(follower, gust_mps=0.0), plan, lever_m)
+    parallel = [line.kind in ("survey", "fill") for line in plan.lines]
     # Beyond half of its speed, and on wide circles, turns leave more of the area unseen.
-    exceeds = offset_m > allowed_m or follower.current_mps > 0.5 * plan.speed_mps
+    exceeds = (
+        steady_m[parallel].max(initial=0.0) > allowed_m
+        or follower.current_mps > 0.5 * plan.speed_mps
+    )
     exceeds |= follower.circle_m > 0.5 * plan.line_spacing_m
     if exceeds and (chosen or not follower.sways):
         towards_deg = math.degrees(math.atan2(*follower.current_ne_mps[::-1])) % 180.0
@@ -290,9 +292,7 @@ def _cola2(export: Export, files: Iterable[Path], *, chosen: bool) -> list[str]:
         f"  section/min_surge_velocity {own.min_surge_mps:g} m/s",
         f"  section/max_surge_velocity {own.max_surge_mps:g} m/s",
         f"{expected[0].upper()}{expected[1:]}.",
-        *([f"In turns it leaves the allowed area by up to {outside_m:.2f} m (area.turn_margin_m)."]
-          if outside_m >= 0.005 else []),
-    ]  # fmt: skip
+    ]
 
 
 def _ardusub(export: Export) -> list[str]:

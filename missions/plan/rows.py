@@ -94,7 +94,11 @@ def main_settings(plan_json: dict[str, Any]) -> str:
     rows = plan_json["details"]["imaging"]["rows"]
     shown = {row["name"]: [row[key] for key in ("name", "text", "bound_by")] for row in rows}
     table = text_table(("setting", "value", "bound by"), [shown[n] for n in _MAIN if n in shown])
-    return f"{table}\nEvery setting with its equation: plan/settings.txt, or --all\n"
+    return (
+        f"{table}\nSeveral values: over the top / mean / bottom of the relief; of overlaps at the "
+        "mean / over the top / there\nwith lines off their track; of signal to noise in red / green "
+        "/ blue. Equations: plan/settings.txt, or --all\n"
+    )
 
 
 def imaging_rows(found: ImagingSettings, setup: ImagingSetup) -> tuple[Setting, ...]:

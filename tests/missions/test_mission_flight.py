@@ -35,7 +35,7 @@ from missions.fly.simulation import (
     simulate_mission,
 )
 from missions.route.energy import planned_vehicle
-from missions.values.flight import Flight
+from missions.values.flight import Flight, rms
 from missions.values.plan_file import Plan
 from tests.missions.flown_plans import plan_of, planned, survey, walk
 from tests.refusals import refused
@@ -172,6 +172,9 @@ def test_cola2_leaves_the_area_by_no_more_than_is_stated(
     (stated,) = re.findall(r"allowed area by up to ([0-9.]+) m", about)
     stated_m = float(stated)
     assert flight.expected_m[1] == pytest.approx(stated_m, abs=0.006)
+    off_m = float(re.findall(r"about ([0-9.]+) m where lines begin", about)[0])
+    assert flight.allowed_off_m.max() == pytest.approx(off_m, abs=0.006)
+    assert 0.05 * off_m < rms(flight.line_errors[0]) < off_m
     worst_m = flight.outside_m.max()
     assert worst_m < stated_m + plan.allowed_offset_m
     assert worst_m > stated_m - 0.6  # no free pass

@@ -64,8 +64,8 @@ def _flight(held: Held) -> Iterator[Verdict]:
     if flight is not None:
         seen, whole = flight.coverage.share_at_overlap, flight.ending == "complete"
         yield _verdict(
-            f"flight: {flight.stations} of {flight.stations_planned} stations, {share(seen)} of "
-            "the area pictured as often as required"
+            f"flight: {flight.stations} stations ({flight.stations_planned} planned), "
+            f"{share(seen)} of the area pictured as often as required"
             + ("" if whole else f"; it ended early: {flight.ending}"),
             _FLY_HOLES,
             good=whole and seen >= _WELL_COVERED,

@@ -1,4 +1,5 @@
 import math
+import re
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +15,7 @@ from alice_survey.core.errors import keep_warnings
 from alice_survey.sim.vehicle.pilot.mission import steady_drift
 from camera_calib.rig import Rig
 from missions.exports import format as options
-from missions.exports.follower import Follower, line_offset_m
+from missions.exports.follower import Follower, off_lines_m
 from missions.exports.format import Options, line_tolerance_m, options_of
 from missions.exports.write import write_exports
 from missions.values.footprint import common_swath
@@ -183,15 +184,24 @@ def test_lines_that_cola2_cannot_hold_are_said_beforehand(
     known = sea_options(vehicle, current_mps=0.1, current_towards_deg=towards_deg)
     with keep_warnings() as warnings:
         write_exports(tmp_path, small_plan(), RIG, formats=formats, options=known)
-    assert any("COLA2 holds" in text for text in warnings) == warns
+    assert any("COLA2 keeps" in text for text in warnings) == warns
     assert all("\n" not in text for text in warnings)
 
 
-def test_a_current_holds_the_glass_off_its_line() -> None:
-    follower = sea_options(current_mps=0.05, current_towards_deg=90.0).follower
+def test_a_current_holds_the_glass_off_its_line(tmp_path: Path) -> None:
+    """Off lines across it as in closed form, with two sigmas of its changes."""
+    plan, known = golden_plan(), sea_options(current_mps=0.05, current_sigma_mps=0.01)
+    follower = known.follower
     assert follower is not None
-    # Of the glass 0.55 m ahead of a vehicle that heads upstream.
-    wanted = (follower.delta_m - 0.55) * steady_drift(0.05, 0.2)
-    for heading_rad, expected in ((0.0, wanted), (math.pi, -wanted), (math.pi / 2, 0.0)):
-        offset_m = line_offset_m(follower, heading_rad, 0.2, 0.55)
-        assert offset_m == pytest.approx(expected, abs=1e-12)
+    lever_m = RIG.body_from_cam("left").apply([0.0, 0.0, 0.03])[0]
+    off_m = off_lines_m(follower, plan, lever_m)
+    for line, off in zip(plan.lines, off_m, strict=True):
+        across_mps = 0.05 * abs(math.sin(math.pi / 2 - line.heading_rad)) + 0.02
+        drift = steady_drift(across_mps, plan.speed_mps)
+        # Of the glass ahead of a vehicle that heads upstream.
+        assert off == pytest.approx((follower.delta_m - lever_m) * drift, rel=1e-6)
+    write_exports(tmp_path, plan, RIG, formats=["cola2"], options=known)
+    stated = re.findall(r"(?:within|about) ([0-9.]+) m", (tmp_path / "about.txt").read_text())
+    # The worst of all lines, also of those across the others.
+    assert float(stated[0]) == pytest.approx(off_m.max(), abs=0.005)
+    assert float(stated[1]) > float(stated[0])
