@@ -152,7 +152,7 @@ def in_workspace(path: str | Path, within: str) -> Path:
 
 
 def first_fault(error: "ValidationError", whole: str = "", known: Collection[str] = ()) -> str:
-    """The first value that a model refuses, and why, on one line; a name not known goes before all.
+    """The first value that a model refuses, and why, on one line; what is missing comes last.
 
     Args:
         error: of pydantic.
@@ -160,7 +160,7 @@ def first_fault(error: "ValidationError", whole: str = "", known: Collection[str
         known: names that values may have.
     """
     faults = error.errors(include_url=False)
-    first = min(faults, key=lambda fault: fault["type"] != "extra_forbidden")
+    first = min(faults, key=lambda fault: fault["type"] == "missing")
     where = ".".join(map(str, first["loc"])) or whole
     text = as_line(first["msg"].removeprefix("Value error, "))
     if known and first["type"] == "extra_forbidden" and len(first["loc"]) == 1:

@@ -1,12 +1,12 @@
 """Camera and strobe settings that an altitude, a speed and an overlap ask for.
 
-The interval follows from the footprint, with the paper's rule next to it; the exposure from the
-motion of the sea floor over the sensor, from speed and attitude rates. While the vehicle moves with
-(u, 0, 0) and turns with (p, q, r), a point of the sea floor at P in the body's frame moves by
--(u, 0, 0) - (p, q, r) x P; the exact flat-port camera's slopes take that to pixels a second. So a
-level camera sees `u / pixel` from speed; about `H p / pixel` (the water's index within: pixel = D /
-f with D nearly H / n) at the centre from roll or pitch; and `corner radius * r` at the corners from
-yaw, plus the sideways motion of a camera ahead of the vehicle's centre.
+The interval follows from the footprint; the exposure from the motion of the sea floor over the
+sensor, from speed and attitude rates. While the vehicle moves with (u, 0, 0) and turns with (p, q,
+r), a point of the sea floor at P in the body's frame moves by -(u, 0, 0) - (p, q, r) x P; the exact
+flat-port camera's slopes take that to pixels a second. So a level camera sees `u / pixel` from
+speed; about `H p / pixel` (the water's index within: pixel = D / f with D nearly H / n) at the
+centre from roll or pitch; and `corner radius * r` at the corners from yaw, plus the sideways motion
+of a camera ahead of the vehicle's centre.
 """
 
 import math
@@ -39,26 +39,6 @@ from missions.exposure.strobe import Storage, StrobeLoad, storage_load, strobe_l
 from missions.values.footprint import footprint_size_m, overlap, step_for_overlap
 
 EXPOSURE_STEP_S = 1e-5
-
-
-@dataclass(frozen=True, kw_only=True)
-class PaperRule:
-    """What the paper's frame rate r = u / (H (1 - O)) gives (its section VII.A).
-
-    It takes the altitude H for the footprint along the track, which fits no lens of the paper.
-    """
-
-    rate_hz: float
-    forward_overlap: float
-    """What it really gives with this footprint."""
-
-
-def paper_rule(plan: PlanConfig, footprint_along_m: float) -> PaperRule:
-    """The paper's frame rate and the overlap that it really gives."""
-    rate_hz = plan.speed_mps / (plan.altitude_m * (1.0 - plan.forward_overlap))
-    return PaperRule(
-        rate_hz=rate_hz, forward_overlap=overlap(footprint_along_m, plan.speed_mps / rate_hz)
-    )
 
 
 def floor_to(value: float, step: float) -> float:
@@ -219,7 +199,6 @@ class ImagingSettings:
     imaging_w: float
     """Mean power of the strobes from the battery while a line is flown; cameras and recorder are
     in `vehicle.hotel_w`."""
-    paper_rule: PaperRule
     footprints: FootprintRange
     spacing: Spacing
     blur: BlurRates
@@ -282,7 +261,6 @@ def imaging_settings(rig: Rig, setup: ImagingSetup, *, quiet: bool = False) -> I
         strobe_lead_s=plan.strobe_lead_s,
         strobe_duty=load.duty,
         imaging_w=load.mean_w,
-        paper_rule=paper_rule(plan, along_m),
         footprints=prints,
         spacing=spacing,
         blur=rates,

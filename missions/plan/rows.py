@@ -96,7 +96,7 @@ def main_settings(plan_json: dict[str, Any]) -> str:
     table = text_table(("setting", "value", "bound by"), [shown[n] for n in _MAIN if n in shown])
     return (
         f"{table}\nSeveral values: over the top / mean / bottom of the relief; of overlaps at the "
-        "mean / over the top / there\nwith lines off their track; of signal to noise in red / green "
+        "mean / over the top / there\nwith lines off track; of signal to noise in red / green "
         "/ blue. Equations: plan/settings.txt, or --all\n"
     )
 
@@ -110,7 +110,7 @@ def imaging_rows(found: ImagingSettings, setup: ImagingSetup) -> tuple[Setting, 
     """
     groups = {
         "footprint and lines": _footprint_rows(found, setup),
-        "frame rate": _rate_rows(found, setup),
+        "frame rate": _rate_rows(found),
         "exposure": _exposure_rows(found, setup),
         "focus and aperture": _focus_rows(found, setup),
         "light": _light_rows(found, setup),
@@ -148,8 +148,8 @@ def _footprint_rows(found: ImagingSettings, setup: ImagingSetup) -> list[Row]:
     ]  # fmt: skip
 
 
-def _rate_rows(found: ImagingSettings, setup: ImagingSetup) -> list[Row]:
-    rule, prints, step_m = found.paper_rule, found.footprints, found.station_spacing_m
+def _rate_rows(found: ImagingSettings) -> list[Row]:
+    prints, step_m = found.footprints, found.station_spacing_m
     top_overlap = 1.0 - step_m / prints.top.along_m
     return [
         ("interval", found.interval_s, "s", "L (1 - O) / u", "forward_overlap",
@@ -157,10 +157,6 @@ def _rate_rows(found: ImagingSettings, setup: ImagingSetup) -> list[Row]:
          f"and the cameras take {1 / found.shortest_interval_s:.3g}"),
         ("forward overlap", (found.forward_overlap, max(0.0, top_overlap)), "%", "1 - u T / L",
          "interval", "at the mean / over the top of the relief"),
-        ("the paper's rule", rule.rate_hz, "Hz", "r = u / (H (1 - O))", "not used",
-         f"it takes the altitude of {setup.plan.altitude_m:g} m for the footprint, which is "
-         f"{prints.mean.along_m:.3f} m: {rule.forward_overlap:.0%} overlap instead of "
-         f"{setup.plan.forward_overlap:.0%}"),
     ]  # fmt: skip
 
 

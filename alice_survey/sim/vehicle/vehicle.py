@@ -33,8 +33,10 @@ from alice_survey.sim.vehicle.coefficients import (
     COMPUTED,
     ESTIMATED,
     FORCES,
+    MOTIONS,
     SHAPES,
     Coefficients,
+    kind_of,
 )
 from alice_survey.sim.vehicle.dynamics import Body, Plant
 from alice_survey.sim.vehicle.fins import Fin, pack_fins
@@ -355,7 +357,32 @@ def _vehicle_of(path: Path, text: str, coefficients: str) -> Vehicle:
             raise VehicleError(f"{path}: two {what} have one name")
     own = {name: getattr(found, name) for name in _VehicleFile.model_fields if name in _OF_VEHICLE}
     own |= {"name": found.name or path.stem}
-    return Vehicle(**own | {"coefficients": _choose_set(path, found, coefficients)})
+    vehicle = Vehicle(**own | {"coefficients": _choose_set(path, found, coefficients)})
+    _check_body(path, vehicle)
+    return vehicle
+
+
+def _check_body(path: Path, vehicle: Vehicle) -> None:
+    """Refuse a body that is wider spread than its hull, or that nothing holds upright.
+
+    Of masses between two ends those at the ends have the greatest inertia (Popoviciu); the hull is
+    no taller than it is long.
+    """
+    body, hull = vehicle.rigid_body, vehicle.hull
+    reach_m = np.hypot(hull.nose_m + hull.tail_m, 2.0 * hull.half_breadth_m) / 2.0
+    max_kg_m2 = body.dry_kg * reach_m**2
+    if 0.0 < max_kg_m2 < max(body.inertia_kg_m2):
+        raise VehicleError(
+            f"{path}: rigid_body.inertia_kg_m2 is {max(body.inertia_kg_m2):g}: {body.dry_kg:g} kg "
+            f"within the hull have at most {max_kg_m2:.3g}"
+        )
+    arms = [np.cross(each.position_body_m, each.direction_body) for each in vehicle.thrusters]
+    is_level = np.any(np.array(arms).reshape(-1, 3), axis=0)[:2].all()
+    if body.cg_body_m[2] < 0.0 and not is_level:
+        raise VehicleError(
+            f"{path}: rigid_body.cg_body_m is {-body.cg_body_m[2]:g} m above the centre of "
+            "buoyancy: it turns over, as no thrusters hold it level; give 0 or more, down"
+        )
 
 
 def _with_shape(table: dict[str, Any]) -> dict[str, Any]:
@@ -443,23 +470,21 @@ def coefficients_from_file(path: Path) -> Coefficients:
     values = parse_table(path, dict[str, float], values)
     if not values:
         raise VehicleError(f"{path}: holds no coefficients")
-    found = _coefficients(path, str(table.get("name", path.stem)), values)
-    ways = (found.linear, found.quadratic, found.quadratic_back)
-    driving = np.flatnonzero(np.max([np.diag(way) for way in ways], axis=0) > 0)
-    if len(driving):
-        axis = FORCES[driving[0]]
-        raise VehicleError(
-            f"{path}: the damping of {axis} is positive, which would drive the vehicle: damping is "
-            "negative"
-        )
-    return found
+    return _coefficients(path, str(table.get("name", path.stem)), values)
 
 
 def _coefficients(path: Path, name: str, values: Mapping[str, float]) -> Coefficients:
     try:
-        return Coefficients(name=name, values=values)
+        found = Coefficients(name=name, values=values)
     except VehicleError as error:
         raise VehicleError(f"{path}: {as_line(str(error))}") from None
+    for key, value in values.items():
+        damps = kind_of(key) not in ("dot", "lift")
+        if damps and value > 0 and FORCES.index(key[0]) == MOTIONS.index(key[2]):
+            raise VehicleError(
+                f"{path}: {key} is {value:g}: damping is negative, else it drives"
+            )
+    return found
 
 
 def read_table(path: Path) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from alice_survey.core.errors import PlanError
 from missions.exposure.footprints import pixel_on_floor_m
-from missions.exposure.settings import blur_rates, exposure_for_rate, imaging_settings, paper_rule
+from missions.exposure.settings import blur_rates, exposure_for_rate, imaging_settings
 from missions.values.footprint import footprint_size_m
 from tests.missions.exposure.surveys import conflict_of, survey
 from tests.oracles_imaging import moved_pixel
@@ -25,7 +25,8 @@ def test_settings_of_the_papers_mission() -> None:
     assert 1 / planned.interval_s == pytest.approx(0.447, abs=0.003)
     assert planned.forward_overlap == pytest.approx(0.6, abs=1e-3)
     assert planned.strobe_pulse_s == pytest.approx(planned.exposure_s + 2 * 0.2e-3)
-    assert planned.paper_rule.forward_overlap == pytest.approx(0.285, abs=1e-3)
+    # The paper's r = u / (H (1 - O)), 0.25 Hz, takes the altitude for the footprint.
+    assert 1 - 0.2 / 0.25 / planned.footprint_along_m == pytest.approx(0.285, abs=1e-3)
     assert planned.focus.focus_mean_air_m == pytest.approx(1.52, abs=0.005)
     # Speed alone allows 2.24 ms at the centre; the corners and the attitude rates take their share.
     assert 1.5e-3 < planned.exposure_s < 2.24e-3
@@ -146,15 +147,6 @@ def test_the_exposure_is_the_longest_that_blurs_no_more(allowed: float, rate: fl
     exposure_s = exposure_for_rate(allowed, rate)
     assert exposure_s * rate <= allowed + 1e-6 * 1e-5 * rate + 1e-9 * rate
     assert (exposure_s + 1.01e-5) * rate >= allowed
-
-
-def test_the_papers_rule_gives_28_percent_not_60() -> None:
-    rig, config = survey(ideal_port=True, water={"n_water": 1.33})
-    along_m = footprint_size_m(rig.cameras["left"], 2.0)[1]
-    rule = paper_rule(config.plan, along_m)
-
-    assert rule.rate_hz == pytest.approx(0.25)
-    assert rule.forward_overlap == pytest.approx(0.28, abs=0.005)
 
 
 def test_a_camera_that_is_too_slow_suggests_the_speed_that_just_fits() -> None:

@@ -209,3 +209,33 @@ def test_a_geometry_gives_hull_water_and_coefficients_to_any_file(tmp_path: Path
     own.write_text(alice.replace('"estimated", "cfd", ', ""))
     with pytest.raises(VehicleError, match="'cfd' are not known; known: calibrated, computed"):
         vehicle_from(str(own), "cfd")
+
+
+@pytest.mark.parametrize(
+    ("known", "changes", "match"),
+    [
+        ("alice", {"cg_body_m = [0.0, 0.0, ": "cg_body_m = [0.0, 0.0, -"}, "cg_body_m"),
+        (
+            "bluerov2_heavy",
+            {"cg_body_m = [0.0, 0.0, ": "cg_body_m = [0.0, 0.0, -"},
+            "",
+        ),  # its thrusters hold it level
+        ("remus100", {"3.438, 3.45]": "3.438, 14.5]"}, r"inertia_kg_m2.* 14\.2"),
+        ("remus100", {"3.438, 3.45]": "13.5, 13.5]"}, ""),  # two weights at its ends
+        ("remus100", {"Y_vv = -": "Y_vv = "}, "Y_vv"),
+    ],
+)
+def test_a_body_that_no_physics_allows_is_refused(
+    known: str, changes: dict[str, str], match: str, tmp_path: Path
+) -> None:
+    text = (Path(files.__file__).parent / "fleet_files" / f"{known}.toml").read_text()
+    for old, new in changes.items():
+        assert text.count(old) == 1
+        text = text.replace(old, new)
+    own = tmp_path / "own.toml"
+    own.write_text(text)
+    if match:
+        with pytest.raises(VehicleError, match=rf"own\.toml: .*{match}"):
+            vehicle_from(str(own))
+    else:
+        assert vehicle_from(str(own)).thrusters

@@ -98,7 +98,7 @@ def test_coefficients_go_through_a_file(tmp_path: Path) -> None:
     [
         ('{"format": "else 2", "values": {"X_uu": 1}}', "'else 2'"),
         ("{}", r"found\.json"),
-        ('{"X_uu": -14.0, "Y_vv": 300.0}', r"found\.json: .* Y "),  # damping must damp
+        ('{"X_uu": -14.0, "Y_vv": 300.0}', r"found\.json: Y_vv"),  # damping must damp
         ('{"a": -14.0}', r"found\.json: .*\'a\'"),
     ],
 )
