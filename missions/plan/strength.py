@@ -82,7 +82,7 @@ def current_error(flown: energy.FlightConditions, what: str, *, is_set: bool = T
         max_mps = math.floor(100.0 * last_that_fits(flies, slow_mps, speed, 1e-3)) / 100.0
         limits = "plan.speed_mps", "the thrust of the vehicle"
         return conflict(said, limits, "plan.speed_mps", max_mps)
-    return PlanError(f"{said} with the thrust it has left: check vehicle.failures")
+    return PlanError(f"{said} {energy.lacking_thrust(flown.vehicle)}")
 
 
 def _min_fin_speed_mps(flown: energy.FlightConditions, current_mps: float) -> float | None:

@@ -39,6 +39,8 @@ from alice_survey.sim.vehicle.pilot.settings import (
     STEP_MPS,
     turn_in_place_rate_rad_s,
 )
+from alice_survey.sim.vehicle.propulsion import thrust_limits
+from alice_survey.sim.vehicle.sea import GRAVITY
 from alice_survey.sim.vehicle.steady import fin_flight, min_radius_m, steady_flight
 from alice_survey.sim.vehicle.vehicle import Vehicle, coefficients_from_file, vehicle_to_fly
 from missions.values.costs import SETTLE_S, Costs
@@ -511,11 +513,26 @@ def _heave(conditions: FlightConditions) -> tuple[float, float]:
     power = _power(vehicle, nu).reshape(2, -1).mean(axis=0)
     can = np.flatnonzero(np.isfinite(power))
     if not len(can):
-        raise PlanError(
-            f"{vehicle.name} cannot dive with the vertical thrust it has left: "
-            "check vehicle.failures"
-        )
+        raise PlanError(f"{vehicle.name} cannot dive {lacking_thrust(vehicle)}")
     return float(_HEAVES_MPS[can[0]]), float(power[can[0]])
+
+
+def lacking_thrust(vehicle: Vehicle) -> str:
+    """Why the thrust of a vehicle is not enough: its weight in water, or what it has lost."""
+    ends = np.zeros((2, len(vehicle.thrusters)))
+    health = np.full(len(vehicle.thrusters), STEADY_SHARE)
+    thrust_limits(vehicle.plant.propulsion, health, np.zeros(6), *ends)
+    most_up_n, most_down_n = np.sort(vehicle.configuration_matrix[2] * ends, axis=0).sum(axis=1)
+    body = vehicle.rigid_body
+    sinks_n = (body.dry_kg - body.buoyancy_kg) * GRAVITY
+    if vehicle.fins or -most_down_n <= sinks_n <= -most_up_n:
+        return "with the thrust it has left: check vehicle.failures"
+    way, at_hand_n = ("up", -most_up_n) if sinks_n > 0.0 else ("down", most_down_n)
+    return (
+        f"as rigid_body.dry_kg {body.dry_kg:g} less buoyancy_kg {body.buoyancy_kg:g} weighs "
+        f"{sinks_n:.1f} N in water, and its thrusters push {way} with {at_hand_n:.1f} N at most "
+        f"({STEADY_SHARE:.0%} of their thrust): trim it, or check the thrusters"
+    )
 
 
 def flies_everywhere(conditions: FlightConditions) -> bool:

@@ -11,6 +11,7 @@ import pytest
 
 from alice_survey.core.config import SurveyConfig, load_config, parse_config
 from alice_survey.core.errors import AliceError, ConfigError
+from alice_survey.sim.vehicle import vehicle as vehicles
 from missions.exposure.settings import ImagingSetup, imaging_settings
 from missions.plan.rows import imaging_rows, settings_table
 from missions.plan.strength import survey_costs
@@ -112,3 +113,17 @@ def test_a_vehicle_without_thrust_is_refused() -> None:
     dead = ["starboard", "port", "vertical", "bow", "stern"]
     with pytest.raises(AliceError, match=r"alice has no thruster left: check vehicle\.failures"):
         survey_costs(parse_config({"vehicle": {"failures": dead}}, "settings"))
+
+
+@pytest.mark.parametrize(("dry_kg", "way"), [(60.0, "up"), (44.0, "down")])
+def test_a_vehicle_out_of_trim_is_refused_by_its_weight(
+    dry_kg: float, way: str, tmp_path: Path
+) -> None:
+    known = Path(vehicles.__file__).parent / "fleet_files/alice.toml"
+    own = tmp_path / "own.toml"
+    own.write_text(known.read_text().replace("dry_kg = 52.0", f"dry_kg = {dry_kg}"))
+    weight_n = (dry_kg - 52.1) * 9.8
+    with pytest.raises(
+        AliceError, match=rf"dry_kg {dry_kg:g} .* {weight_n:.0f}\.\d N .*push {way}"
+    ):
+        survey_costs(parse_config({"vehicle": {"name": str(own)}}, "settings"))
