@@ -287,7 +287,7 @@ def _record_of(
         line=np.full(len(kept), -1) if triggers.line is None else triggers.line[kept],
         time_s=time_s,
     )
-    _check_place(path, plan, stations)
+    _check_place(path, plan, at)
     max_m = MAX_ALTITUDES * plan.altitude_m
     high, below = stations.altitude_m > max_m, stations.altitude_m <= 0
     stations = stations.some(~(high | below))
@@ -365,7 +365,7 @@ def glass_places(at: Mapping[str, Array], attitude: Array, plan: Plan, rig: Rig)
     return glass_ned
 
 
-def _check_place(path: Path, plan: Plan, stations: Stations) -> None:
+def _check_place(path: Path, plan: Plan, at: Mapping[str, Array]) -> None:
     """Refuse a log of another place.
 
     Raises:
@@ -373,14 +373,20 @@ def _check_place(path: Path, plan: Plan, stations: Stations) -> None:
     """
     import shapely
 
-    away_m = np.atleast_1d(shapely.distance(shapely.points(stations.glass_ne), plan.area.survey))
-    nearest = int(np.argmin(away_m))
-    if away_m[nearest] > _ELSEWHERE_M:
-        latitude, longitude = plan.datum.latitude_deg, plan.datum.longitude_deg
+    places = np.column_stack([at["latitude_deg"], at["longitude_deg"], 0.0 * at["latitude_deg"]])
+    away_m, turned_m = (
+        shapely.distance(shapely.points(ned[:, :2]), plan.area.survey).min()
+        for ned in map(plan.datum.ned_from_geodetic, (places, places[:, [1, 0, 2]]))
+    )
+    if away_m > _ELSEWHERE_M:
+        advice = "give the log of this survey, or its plan"
+        if turned_m <= _ELSEWHERE_M:
+            advice = "are its latitudes and longitudes exchanged?"
         raise NavigationError(
-            f"{path}: the log is {away_m[nearest] / 1e3:.3g} km from the area of {plan.name!r} at "
-            f"{latitude:.5f}, {longitude:.5f} at its nearest: give the log of this survey, or its "
-            "plan"
+            f"{path}: the log, from {places[0, 0]:.5f}, {places[0, 1]:.5f} on, is "
+            f"{away_m / 1e3:.3g} km from the area of {plan.name!r} at "
+            f"{plan.datum.latitude_deg:.5f}, {plan.datum.longitude_deg:.5f} at its nearest: "
+            f"{advice}"
         )
 
 

@@ -20,6 +20,8 @@ from missions.plan.strength import survey_costs
 from missions.values.plan_file import Plan, read_plan
 
 _LISTED = 20
+_MIN_COVERED = 0.9
+"""A survey that lacks more than a tenth of its area is not good enough, as in the report."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -169,6 +171,12 @@ def check_report(
                 f"at that overlap: {folder / 'refly'}"
             )
     _write(folder, check, data)
+    if check.flown.share_at_overlap < _MIN_COVERED:
+        data["shortfall"] = (
+            f"{share(check.flown.share_at_overlap, 2)} of the area is at the requested overlap, "
+            f"less than {_MIN_COVERED:.0%}: fly the holes again"
+        )
+        warn(data["shortfall"])
     files = "certificate.json, coverage.png, coverage.tif, holes.geojson"
     return f"{text}\n{folder}: {files}", {**data, "folder": str(folder)}
 

@@ -16,11 +16,13 @@ import numpy as np
 
 from alice_survey.core.artefacts import stream_csv
 from alice_survey.core.contents import as_line, is_nowhere, is_unknown, parse_number
-from alice_survey.core.errors import NavigationError, warn
+from alice_survey.core.errors import NavigationError, note, warn
 from alice_survey.core.frames import SYSTEM, Array, degrees_from
 from alice_survey.kit.words import count
 from missions.values.navigation import COLUMNS
 
+_DOTTED = re.compile(r"^(\d\d)\.(\d\d)\.(\d{4})\b")
+"""Dates between dots are day.month.year (DIN 5008)."""
 POSITION, READINGS = COLUMNS[:3], COLUMNS[:7]
 """What a navigation log can measure; the other columns are sigmas."""
 IMAGE, HEIGHT = "image", "height_m"
@@ -176,12 +178,12 @@ def find_zone(name: str) -> tzinfo:
 
 
 def utc_date(text: str, zone: tzinfo = UTC) -> datetime:
-    """The moment of an ISO 8601 date; one that names no zone is of `zone`.
+    """The moment of an ISO 8601 date, or of day.month.year; one that names no zone is of `zone`.
 
     Raises:
         ValueError: it is not a date.
     """
-    date = datetime.fromisoformat(text)
+    date = datetime.fromisoformat(_DOTTED.sub(r"\3-\2-\1", text.strip()))
     try:
         return (date.replace(tzinfo=zone) if date.tzinfo is None else date).astimezone(UTC)
     except OverflowError:  # in the years 1 and 9999
@@ -225,6 +227,8 @@ def _usual_columns(path: Path, header: Sequence[str], *, by_picture: bool) -> di
         if {"east", "north", "easting", "northing"} & set(bare.values()):
             meant |= dict.fromkeys(("latitude_deg", "longitude_deg"))
         hint = f"; did you mean {', '.join(meant)}?" if meant else ""
+        if any(re.search(r"[_ (\[](ft|feet|fsw)\b", one, re.IGNORECASE) for one in lost):
+            hint = ": lengths are read in metres: convert feet"
         warn(f"{path}: not read: columns {as_line(', '.join(lost))}{hint}")
     return found
 
@@ -317,18 +321,22 @@ def read_navigation(
     if not clocks and not named:
         lacks = ["time_s or time_utc" + (" or image" if by_picture else "")]
     if lacks:
-        raise NavigationError(f"{path}: no column {lacks[0]}; it has {as_line(', '.join(header))}")
+        raise NavigationError(
+            f"{path}: no column {lacks[0]}; of these and {', '.join(READINGS)}, or their usual "
+            f"names, it has {as_line(', '.join(header))}"
+        )
     others = [name for name in (*COLUMNS, HEIGHT) if name in at and name not in needed]
     names = [*needed, *others]
     if not set(names) & {*READINGS, HEIGHT}:
         raise NavigationError(f"{path}: none of the columns {', '.join(READINGS)}")
-    start_utc: datetime | None = None
+    start_utc, first = None, ""
     times, table, row_of = array("d"), array("d"), dict[str, int]()
     faults: dict[str, list[int]] = {}
     for line, row in rows:
         try:
             time = _time_of_row(row, at, clocks[0], zone) if clocks else math.nan
             if isinstance(time, datetime):
+                first = row[at[clocks[0]]] if start_utc is None else first
                 start_utc = start_utc or time
                 time = (time - start_utc).total_seconds()
             values = [_number(row[at[name]], name) for name in needed]
@@ -362,6 +370,8 @@ def read_navigation(
         ]  # fmt: skip
         more = f" and {len(texts) - _NAMED} more" if len(texts) > _NAMED else ""
         warn(f"{path}: left out {'; '.join(texts[:_NAMED])}{more}")
+    if re.fullmatch(r"[^:]+:[^Z+-]+", first) and not is_growing:
+        note(f"{path}: times name no zone: {first} is taken as {start_utc:%Y-%m-%d %H:%M:%S} UTC")
     cells = np.asarray(table).reshape(len(times), len(names))
     columns = {name: cells[:, i] for i, name in enumerate(names)}
     if HEIGHT in columns:

@@ -522,12 +522,12 @@ def lacking_thrust(vehicle: Vehicle) -> str:
     ends = np.zeros((2, len(vehicle.thrusters)))
     health = np.full(len(vehicle.thrusters), STEADY_SHARE)
     thrust_limits(vehicle.plant.propulsion, health, np.zeros(6), *ends)
-    most_up_n, most_down_n = np.sort(vehicle.configuration_matrix[2] * ends, axis=0).sum(axis=1)
+    up_n, down_n = np.sort(vehicle.configuration_matrix[2] * ends, axis=0).sum(axis=1)
     body = vehicle.rigid_body
     sinks_n = (body.dry_kg - body.buoyancy_kg) * GRAVITY
-    if vehicle.fins or -most_down_n <= sinks_n <= -most_up_n:
+    if vehicle.fins or -down_n <= sinks_n <= -up_n:
         return "with the thrust it has left: check vehicle.failures"
-    way, at_hand_n = ("up", -most_up_n) if sinks_n > 0.0 else ("down", most_down_n)
+    way, at_hand_n = ("up", -up_n) if sinks_n > 0.0 else ("down", down_n)
     return (
         f"as rigid_body.dry_kg {body.dry_kg:g} less buoyancy_kg {body.buoyancy_kg:g} weighs "
         f"{sinks_n:.1f} N in water, and its thrusters push {way} with {at_hand_n:.1f} N at most "

@@ -291,8 +291,9 @@ def main() -> None:
         1: a known fault, in one line; of the program itself a traceback
         2: an option or argument that is none
         3: done, and not good enough: a flight that ended early, a calibration with a `bad` verdict,
-            less than half of the pictures in the model, a check (`fov --validate`) that failed, a
-            mission of `pilot` that was not complete. `run` stops there unless `--accept` is given
+            less than half of the pictures in the model, less than 90 % of the area covered as
+            requested (`plan check`), a check (`fov --validate`) that failed, a mission of `pilot`
+            that was not complete. `run` stops there unless `--accept` is given
         129, 130, 143: hung up, Ctrl-C, SIGTERM: the same command goes on from there
     """
     # Modules leave many objects that stay: looking through them again and again for garbage while

@@ -481,9 +481,7 @@ def _coefficients(path: Path, name: str, values: Mapping[str, float]) -> Coeffic
     for key, value in values.items():
         damps = kind_of(key) not in ("dot", "lift")
         if damps and value > 0 and FORCES.index(key[0]) == MOTIONS.index(key[2]):
-            raise VehicleError(
-                f"{path}: {key} is {value:g}: damping is negative, else it drives"
-            )
+            raise VehicleError(f"{path}: {key} is {value:g}: damping is negative, else it drives")
     return found
 
 

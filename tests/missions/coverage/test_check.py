@@ -10,6 +10,7 @@ import rasterio
 import shapely
 from scipy.spatial.transform import RigidTransform
 
+from alice_survey.app.commands.missions import CheckCommand
 from alice_survey.core.config import SurveyConfig
 from alice_survey.core.frames import Array
 from alice_survey.kit.words import share
@@ -73,6 +74,9 @@ def test_a_dive_is_compared_with_its_plan(checked: tuple[Path, str, dict]) -> No
     assert f"{data['holes'][0]['latitude_deg']:.7f}" in text
     written = json.loads((workspace / "check" / "certificate.json").read_text())
     assert written == {key: data[key] for key in written}
+    assert ("shortfall" in data) == (seen.share_at_overlap < 0.9)
+    half = FLOWN.some(FLOWN.line < 4)
+    assert not CheckCommand().is_passed(checked_dive(workspace, half, out=workspace / "half")[1])
 
 
 def test_the_map_and_the_outlines_lie_where_the_hole_is(checked: tuple[Path, str, dict]) -> None:
