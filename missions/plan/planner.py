@@ -127,6 +127,15 @@ def plan_survey(config: SurveyConfig, rig: Rig, *, max_cells: int | None = None)
                 f"{vehicle.name} is built for {rating_m:g} m and would fly at {deepest_m:.0f} m: "
                 "choose another vehicle.name, or check area.seafloor_depth_m"
             )
+        # A hull counts as high above its centre of buoyancy as it is deep below it.
+        high_m = float(hull.points_body_m[:, 2].max()) + glass_body_m[2]
+        shallowest_m = min(chain.from_iterable(depths_m), default=below_m)
+        if shallowest_m < high_m:
+            warn(
+                f"the hull of {vehicle.name} reaches {high_m:.2f} m above the glass, which flies "
+                f"{shallowest_m:.2f} m below the surface: it breaks the surface, and thrusters "
+                "there draw air; lower plan.altitude_m or check area.seafloor_depth_m"
+            )
         laid = Plan(
             name=config.name,
             area=area,

@@ -43,6 +43,14 @@ def planned(**sections: Any) -> Plan:
 SMALL = {"area": {"length_m": 4.6, "width_m": 4.0, "heading_deg": 20.0}}
 
 
+@pytest.mark.parametrize(("depth_m", "breaks"), [(2.19, True), (2.20, False)])
+def test_a_hull_that_breaks_the_surface_is_warned_of(depth_m: float, breaks: bool) -> None:
+    """The glass is 0.08 m below the body's centre, and the hull 0.115 m high above it."""
+    with keep_warnings() as warnings:
+        planned(area={**SMALL["area"], "seafloor_depth_m": depth_m})
+    assert any("0.20 m above the glass" in text for text in warnings) == breaks
+
+
 def test_the_papers_mission() -> None:
     """15 x 17 m, lines 1 m apart, 2 m altitude, 0.2 m/s, 12.5 mm lens."""
     with keep_warnings() as warnings:
