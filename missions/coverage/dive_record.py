@@ -302,10 +302,9 @@ def _record_of(
     long = np.flatnonzero(steps > nav.max_gap_s)
     gaps = [(float(nav.time_s[i]), float(steps[i])) for i in long]
     # What was left out or assumed is in the caller's report.
-    for start_s, length_s in gaps[:8]:
-        warn(f"{path}: a gap of {length_s:.1f} s from {start_s:.1f} s")
-    if len(gaps) > 8:
-        warn(f"{path}: {len(gaps) - 8} more gaps")
+    if gaps:
+        first = ", ".join(f"{length_s:.1f} s from {at_s:.1f} s" for at_s, length_s in gaps[:9])
+        warn(f"{path}: gaps of {first}")
     return DiveRecord(
         source=str(path),
         triggers=triggers.source,

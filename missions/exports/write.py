@@ -127,11 +127,6 @@ def depth_refusal(plan: Plan, name: str) -> str:
         what = "held off its lines by the expected current, a mission for COLA2 would have"
     if not plan.is_flown_by_depth or min_m >= allowed_m:
         return ""
-    if not math.isfinite(allowed_m):
-        return (
-            "the plan follows a bathymetry and does not say how near to it missions come: plan "
-            "again"
-        )
     clearance = "an unknown clearance" if math.isnan(min_m) else f"{min_m:.2f} m of clearance"
     return (
         f"{what} {clearance} over the bathymetry, less than plan.least_clearance_m "

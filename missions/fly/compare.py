@@ -313,7 +313,7 @@ def compare_report(
     executor: Executor | None = None,
     vehicles: Sequence[str] = (),
 ) -> tuple[str, dict[str, Any]]:
-    """Fly a survey by both configurations, and write a table, all figures and a picture.
+    """Fly a survey by both configurations, and write a table and all figures.
 
     Args:
         config: the survey; lines are 1 m apart, as the paper's, where it does not say.
@@ -373,7 +373,6 @@ def compare_report(
         for outcome in outcomes
     )
     write_csv(out / "flights.csv", list(outcomes[0]), rows)
-    draw_cross_track(out / "compare.png", data["cases"])
     return f"{text}\n\nwrote {out}", data
 
 
@@ -404,15 +403,11 @@ def _spread(values: Sequence[float]) -> dict[str, float | None]:
     return spread
 
 
-def _title(case: Mapping[str, Any]) -> str:
-    across, along = case["across_mps"], case["along_mps"]
-    return f"{case['current']} ({across:+.2f} across, {along:+.2f} along)"
-
-
 def _table(cases: Sequence[Mapping[str, Any]]) -> str:
     rows = []
     for case in cases:
-        title, variants = _title(case), case["variants"]
+        across, along, variants = case["across_mps"], case["along_mps"], case["variants"]
+        title = f"{case['current']} ({across:+.2f} across, {along:+.2f} along)"
         rows += [
             (title, f"paper, {name}", *(_paper_cell(name, column) for column in _COLUMNS))
             for name in PAPER
@@ -441,25 +436,3 @@ def _case(text: str) -> Case:
     if speed is None or towards is None or speed < 0.0 or not math.isfinite(speed + towards):
         raise ConfigError(f"current {text!r}: give SPEED@DIRECTION with a speed of 0 or more")
     return Case(current_mps=speed, towards_deg=towards)
-
-
-def draw_cross_track(path: Path, cases: Sequence[Mapping[str, Any]]) -> None:
-    """Draw the true cross-track rms on lines of each vehicle in each sea, next to the paper's."""
-    from alice_survey.kit.figure import INKS, figure_style, new_figure, save_figure
-
-    with figure_style():
-        figure = new_figure(1.0 + 2.2 * len(cases))
-        charts = figure.subplots(len(cases), 1, sharex=True, squeeze=False)[:, 0]
-        for axes, case in zip(charts, cases, strict=True):
-            found = {name: each["lines_true_m"] for name, each in case["variants"].items()}
-            means, spread = (
-                [values.get(key) or 0.0 for values in found.values()] for key in ("mean", "sd")
-            )
-            axes.barh(list(found), means, xerr=spread, color=INKS[0])
-            for name in (name for name in PAPER if name in found):
-                limit = PAPER[name]["cross_track_rms_m"][1]
-                axes.plot(limit, name, "|", color=INKS[1], ms=16, mew=2, label="paper")
-            axes.invert_yaxis()
-            axes.set_title(_title(case))
-        charts[-1].set_xlabel("true cross-track rms on lines, m (paper's as strokes)")
-        save_figure(figure, path)

@@ -360,17 +360,14 @@ def flight_summary(flight: Flight, vehicle: VehicleConfig, rig: Rig) -> dict[str
             "speed_mean_mps": float(speed[on_line].mean()) if on_line.any() else None,
             "altitude_rms_m": _rms(flight.altitude_m[on_line] - plan.altitude_m),
             "altitude_least_m": float(flight.altitude_m[on_line].min()) if on_line.any() else None,
-            "believed_altitude_rms_m": _rms(flight.log.altitude_m[on_line] - plan.altitude_m),
         },
         "in_turns": {
             "roll_rms_deg": _rms(roll[turning]),
             "roll_worst_deg": _worst(roll[turning]),
-            "speed_worst_mps": _worst(speed[turning]),
             "off_route_rms_m": _rms(flight.route_error[turning]),
             "believed_off_route_rms_m": _rms(flight.believed_route_error[turning]),
         },
         "navigation_error_rms_m": _rms(np.linalg.norm(off[following, :2], axis=1)),
-        "power_mean_w": float(flown.power_w.sum(axis=1).mean()),
         "energy_wh": dict(zip(flown.thrusters, energy_wh.tolist(), strict=True)),
         "coverage": covered_shares(plan, rig, stations_of_flight(flight)),
     }

@@ -780,7 +780,6 @@ def mission_summary(known: MissionOfPlan, flight: Flight, rig: Rig) -> dict[str,
         "steps_begun": int(flight.flown.report[-1, LEG]) + 1,
         "line_ends": len(beyond_m),
         "line_ends_overshot": sum(beyond > PASSED_M for beyond in beyond_m),
-        "overshot_worst_m": max(beyond_m, default=0.0),
         "planned": covered_shares(plan, rig, promised),
     }
 

@@ -58,7 +58,7 @@ class Planned:
     warnings: tuple[str, ...]
     """Warnings of the plan."""
     totals: dict[str, float]
-    """Main figures by name, as tables and pages show them."""
+    """Main figures by name, as pages show them."""
     rows: tuple[Setting, ...]
     """Every setting of cameras, strobes and the pattern of lines, with its equation and limit."""
 
@@ -196,11 +196,6 @@ def plan_survey(config: SurveyConfig, rig: Rig, *, max_cells: int | None = None)
         }
         details = json.loads(json.dumps(about))  # as they are read back
         finished = replace(laid, coverage=seen.share_at_overlap, details=details)
-        totals = _totals(finished, imaging, seen, rig)
-        totals |= {
-            "usable_wh": energy.usable_wh(config.vehicle),
-            "aperture": config.camera.f_number,
-        }
         planned = Planned(
             plan=finished,
             imaging=imaging,
@@ -208,34 +203,23 @@ def plan_survey(config: SurveyConfig, rig: Rig, *, max_cells: int | None = None)
             certificate=seen,
             bathymetry=bathymetry,
             warnings=(),
-            totals=totals,
+            totals=_totals(finished, seen, rig),
             rows=rows,
         )
     return replace(planned, warnings=tuple(warnings))
 
 
-def _totals(plan: Plan, imaging: ImagingSettings, seen: Certificate, rig: Rig) -> dict[str, float]:
-    """Main figures of a plan, but for those of its settings."""
+def _totals(plan: Plan, seen: Certificate, rig: Rig) -> dict[str, float]:
+    """Main figures of a plan."""
     cameras = len(rig.cameras)
-    own = ("stations", "length_m", "duration_s", "energy_wh", "altitude_m", "speed_mps",
-           "interval_s", "exposure_s", "line_spacing_m")  # fmt: skip
+    own = ("stations", "duration_s", "energy_wh", "altitude_m")
     return {name: getattr(plan, name) for name in own} | {
         "area_m2": plan.area.survey.area,
         "lines": len(plan.lines),
-        "heading_deg": math.degrees(plan.lines[0].heading_rad),
-        "lines_m": sum(line.length_m for line in plan.lines),
         "pictures": plan.stations * cameras,
-        "longest_dive_wh": max(dive.energy_wh for dive in plan.dives),
         "dives": len(plan.dives),
         "data_gb": raw_bytes(rig.cameras[rig.reference], cameras, plan.stations) / 1e9,
-        "gain_db": imaging.light.gain_db,
-        "sharp_from_m": imaging.focus.near_altitude_m,
-        "sharp_to_m": imaging.focus.far_altitude_m,
-        "gsd_mm": 1e3 * imaging.pixel_m,
-        "forward_overlap": plan.reached_forward_overlap,
         "side_overlap": plan.reached_side_overlap,
-        "covered": seen.covered_share,
-        "stereo": seen.stereo_share,
         "at_overlap": seen.share_at_overlap,
     }
 

@@ -175,8 +175,8 @@ def test_triggers_on_the_way_down_and_up_are_not_amiss(dive: LoggedFlight) -> No
 def test_logs_of_elsewhere_or_another_time_are_refused(dive: LoggedFlight) -> None:
     assert "11.1 km" in dive.refusal(dive.edited({"latitude_deg": "32.9236"}))
     nav = (dive.folder / "nav.csv").read_text()
-    names = ["latitude_deg,longitude_deg", "longitude_deg,latitude_deg"]
-    (dive.folder / "turned.csv").write_text(nav.replace(*names, 1))
+    turned = nav.replace("latitude_deg,longitude_deg", "longitude_deg,latitude_deg", 1)
+    (dive.folder / "turned.csv").write_text(turned)
     assert "longitudes" in dive.refusal(dive.folder / "turned.csv")
 
     late, count = np.asarray(dive.flown.time_s) + 1e6, len(dive.flown)

@@ -23,7 +23,7 @@ def test_totals_and_warnings_are_those_of_the_plan() -> None:
     found, made = preview(config), planned_survey(config)
     plan, totals = made.plan, found["totals"]
     assert found["ok"] and len(plan.dives) == totals["dives"] == 2
-    for name in ("length_m", "duration_s", "energy_wh", "interval_s", "stations", "speed_mps"):
+    for name in ("duration_s", "energy_wh", "stations", "altitude_m"):
         assert totals[name] == getattr(plan, name)
     assert totals["at_overlap"] == plan.coverage
     assert found["warnings"] == list(made.warnings) and found["warnings"]
