@@ -257,10 +257,10 @@ def _cola2(export: Export, files: Iterable[Path], *, chosen: bool) -> list[str]:
     start_m = max((off_m.max() for off_m, _ in flown), default=0.0)
     outside_m = max((outside_m for _, outside_m in flown), default=0.0)
     expected = (
-        f"in the expected current of {follower.current_mps:g} m/s and its gusts COLA2 keeps "
-        f"{follower.name} within {off_lines_m(follower, plan, lever_m).max():.2f} m of lines "
-        f"{plan.line_spacing_m:.2f} m apart, which allow {allowed_m:.2f} m, and about "
-        f"{start_m:.2f} m where lines begin"
+        f"in the expected current of {follower.current_mps:g} m/s and its gusts COLA2 brings "
+        f"{follower.name} onto lines from up to about {start_m:.2f} m and then keeps within "
+        f"{off_lines_m(follower, plan, lever_m).max():.2f} m of them; they are "
+        f"{plan.line_spacing_m:.2f} m apart, which allows {allowed_m:.2f} m"
     )
     if outside_m >= 0.005:
         expected += f"; in turns it leaves the allowed area by up to {outside_m:.2f} m"
