@@ -21,8 +21,8 @@ from alice_survey.core.frames import SYSTEM, Array, degrees_from
 from alice_survey.kit.words import count
 from missions.values.navigation import COLUMNS
 
-_DOTTED = re.compile(r"^(\d\d)\.(\d\d)\.(\d{4})\b")
-"""Dates between dots are day.month.year (DIN 5008)."""
+_DAY_FIRST = re.compile(r"^(?=..\.|1[3-9]|[23]\d)(\d\d)[./-](\d\d)[./-](\d{4})\b")
+"""Dates between dots are day.month.year (DIN 5008), and others whose first number is no month."""
 POSITION, READINGS = COLUMNS[:3], COLUMNS[:7]
 """What a navigation log can measure; the other columns are sigmas."""
 IMAGE, HEIGHT = "image", "height_m"
@@ -183,7 +183,7 @@ def utc_date(text: str, zone: tzinfo = UTC) -> datetime:
     Raises:
         ValueError: it is not a date.
     """
-    date = datetime.fromisoformat(_DOTTED.sub(r"\3-\2-\1", text.strip()))
+    date = datetime.fromisoformat(_DAY_FIRST.sub(r"\3-\2-\1", text.strip()))
     try:
         return (date.replace(tzinfo=zone) if date.tzinfo is None else date).astimezone(UTC)
     except OverflowError:  # in the years 1 and 9999

@@ -103,10 +103,11 @@ def test_dates_obey_their_own_zone_else_the_one_given(
     """Between dots a day comes first; what a time without a zone is taken for is said."""
     header = "time_utc,latitude_deg,longitude_deg,depth_m"
     rows = ["2024-07-01T10:00:02.5+00:00,60,5,2", "01.07.2024 12:00:05,60,5,1"]
+    rows += ["01/07/2024 12:00:06,60,5,1", "13/07/2024 12:00:05,60,5,1"]  # the first may be January
     path = log_file(tmp_path, "2024-07-01 12:00:00,60,5,1", *rows, header=header)
     log = read_navigation(path, find_zone("Europe/Oslo"))
     assert log.start_utc == datetime(2024, 7, 1, 10, tzinfo=UTC)
-    np.testing.assert_allclose(log.time_s, [0, 2.5, 5.0])
+    np.testing.assert_allclose(log.time_s, [0, 2.5, 5.0, 12 * 86400.0 + 5.0])
     assert "2024-07-01 10:00:00 UTC" in capsys.readouterr().err
     read_navigation(log_file(tmp_path, rows[0], header=header), UTC)
     assert not capsys.readouterr().err
