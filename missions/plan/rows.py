@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from alice_survey.core.artefacts import json_values
+from alice_survey.core.config import PlanConfig
 from alice_survey.kit.words import text_table
 from missions.exposure.light import MIDDLE_GREY, SEEN_SHARE
 from missions.exposure.settings import ImagingSettings, ImagingSetup
@@ -110,7 +111,7 @@ def imaging_rows(found: ImagingSettings, setup: ImagingSetup) -> tuple[Setting, 
     """
     groups = {
         "footprint and lines": _footprint_rows(found, setup),
-        "frame rate": _rate_rows(found),
+        "frame rate": _rate_rows(found, setup.plan),
         "exposure": _exposure_rows(found, setup),
         "focus and aperture": _focus_rows(found, setup),
         "light": _light_rows(found, setup),
@@ -148,15 +149,18 @@ def _footprint_rows(found: ImagingSettings, setup: ImagingSetup) -> list[Row]:
     ]  # fmt: skip
 
 
-def _rate_rows(found: ImagingSettings) -> list[Row]:
-    prints, step_m = found.footprints, found.station_spacing_m
-    top_overlap = 1.0 - step_m / prints.top.along_m
+def _rate_rows(found: ImagingSettings, plan: PlanConfig) -> list[Row]:
+    mean_m, step_m = found.footprints.mean.along_m, found.station_spacing_m
+    top, papers_m = found.footprints.top.along_m, plan.altitude_m * (1.0 - plan.forward_overlap)
     return [
         ("interval", found.interval_s, "s", "L (1 - O) / u", "forward_overlap",
          f"{1 / found.interval_s:.3g} pictures a second, one every {step_m:.3g} m; the trigger "
          f"and the cameras take {1 / found.shortest_interval_s:.3g}"),
-        ("forward overlap", (found.forward_overlap, max(0.0, top_overlap)), "%", "1 - u T / L",
-         "interval", "at the mean / over the top of the relief"),
+        ("forward overlap", (found.forward_overlap, max(0.0, 1.0 - step_m / top)), "%",
+         "1 - u T / L", "interval", "at the mean / over the top of the relief"),
+        ("the paper's rule", plan.speed_mps / papers_m, "Hz", "r = u / (H (1 - O))", "not used",
+         f"it takes the altitude for the footprint, {plan.altitude_m:g} m for {mean_m:.3f} m: "
+         f"{1.0 - papers_m / mean_m:.0%} overlap"),
     ]  # fmt: skip
 
 

@@ -72,6 +72,8 @@ def test_the_papers_mission() -> None:
     # the closing line, run-ins, ways from home and back, descent and ascent about half an hour.
     assert 27 * 60 < plan.duration_s < 32 * 60
     assert 20 < plan.energy_wh < 60
+    rule = next(r for r in plan.details["imaging"]["rows"] if r["name"] == "the paper's rule")
+    assert rule["value"] == pytest.approx(0.25) and "29% overlap" in rule["note"]
 
 
 def test_an_ideal_port_gives_the_known_overlap_of_27_percent() -> None:
