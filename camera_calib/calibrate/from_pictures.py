@@ -44,7 +44,7 @@ from camera_calib.calibration import Calibration, HousingTrial
 from camera_calib.freedom import USUAL_LENS
 from camera_calib.mount import mount_line, with_mount
 from camera_calib.optics import PORTS
-from camera_calib.rig import design_rig
+from camera_calib.rig import Rig, design_rig
 from camera_calib.stages import calibration_shortfall
 from camera_calib.targets.target import Target
 
@@ -145,7 +145,24 @@ def calibrate_task(task: CalibrationTask, found: Detections) -> Calibration:
         CalibrationError: the views do not determine it, or are not of the start's cameras.
     """
     _check_sizes(task, found)
-    return _likeliest(task, found)
+    calibration = _likeliest(task, found)
+    opposite = _opposite(calibration.rig, task.start)
+    return replace(calibration, warnings=(*calibration.warnings, *opposite))
+
+
+def _opposite(rig: Rig, start: Rig | None) -> Iterator[str]:
+    """A warning of each camera that lies opposite to where the start, or its name, places it."""
+    first = rig.reference
+    for name in list(rig.cameras)[1:]:
+        place = rig.cam_from_rig[name].inv().translation
+        aside = np.array([1.0, 0.0, 0.0]) * ((first, name) == ("left", "right"))
+        expected = aside if start is None else start.cam_from_rig[name].inv().translation
+        if place @ expected < -0.5 * np.linalg.norm(place) * np.linalg.norm(expected):
+            way = f"to the left of {first}" if start is None else "opposite to where --start has it"
+            yield (
+                f"{name} is {1e3 * np.linalg.norm(place):.4g} mm {way}: exchange the pictures of "
+                f"{first} and {name}, unless the cameras are upside down"
+            )
 
 
 def _check_sizes(task: CalibrationTask, found: Detections) -> None:

@@ -28,12 +28,13 @@ WRITTEN = (
 _GLASS = "glass_thickness_m"
 _PORT_OPTIONS: Mapping[str, tuple[str, str, float, tuple[float, float]]] = {
     "outer_radius_m": ("dome_radius_mm", "--dome-radius", 1e3, (5.0, 1000.0)),
-    "port_distance_m": ("port_distance_mm", "--port-distance", 1e3, (0.0, 500.0)),
-    _GLASS: ("glass_mm", "--glass", 1e3, (0.0, 500.0)),
+    "port_distance_m": ("port_distance_mm", "--port-distance", 1e3, (0.5, 500.0)),
+    _GLASS: ("glass_mm", "--glass", 1e3, (0.5, 500.0)),
     "n_glass": ("n_glass", "--n-glass", 1.0, (1.0, 2.0)),
     "n_water": ("n_water", "--n-water", 1.0, (1.0, 1.4)),
 }
-"""Options that give parameters of ports: field, name, units in one metre or index, range."""
+"""Options that give parameters of ports: field, name, units in one metre or index, range. Lengths
+whose range begins below 1 mm may be 0, but not 0.006: that is one in metres."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -235,10 +236,12 @@ def _port_numbers(
                 value, spread = (float(part or "nan") for part in (number, sigma))
             except ValueError:
                 value = spread = -1.0
-            if (number and not minimum <= value <= maximum) or (is_known_to and not spread > 0.0):
+            is_inside = minimum <= value <= maximum or (value == 0.0 and minimum < 1.0)
+            if (number and not is_inside) or (is_known_to and not spread > 0.0):
                 raise CalibrationError(
                     f"{option} {text}: {word!r} for {camera} is not a number from {minimum:g} to "
-                    f"{maximum:g}, or one with its sigma, such as {maximum / 2:g}+-0.1"
+                    f"{maximum:g}{' mm' * (unit > 1.0)}, or one with its sigma, such as "
+                    f"{maximum / 2:g}+-0.1"
                 )
             if number:
                 values[camera][parameter] = value / unit

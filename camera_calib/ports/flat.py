@@ -47,7 +47,7 @@ class FlatPort(PortValues):
     camera's y and x axes."""
 
     ranges: ClassVar[Mapping[str, tuple[float, float]]] = {
-        "port_distance_m": (0.0, 100.0), **GLASS_AND_WATER
+        "port_distance_m": (0.0, 5.0), **GLASS_AND_WATER
     }  # fmt: skip
     places: ClassVar[tuple[str, ...]] = ("port_distance_m",)
     tilts: ClassVar[tuple[str, ...]] = _NORMAL

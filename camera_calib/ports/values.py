@@ -15,7 +15,7 @@ from camera_calib.lenses.values import OpticalPart
 
 Vector = tuple[float, float, float]
 GLASS_AND_WATER: Mapping[str, tuple[float, float]] = {
-    "glass_thickness_m": (0.0, 10.0),
+    "glass_thickness_m": (0.0, 0.5),
     "n_glass": (1.0, 3.0),
     "n_water": (1.0, 2.0),
 }

@@ -108,6 +108,8 @@ def test_every_camera_needs_a_pose(rig: Rig) -> None:
         (("cameras", "left", "fx_px"), 1e300, "1e+07 px"),
         (("cameras", "left", "width_px"), 640.5, "width_px = 640.5"),
         (("cameras", "left", "n_water"), 5, "n_water = 5: 1 to 2"),
+        (("cameras", "left", "glass_thickness_m"), 6, "glass_thickness_m = 6: 0 to 0.5 m"),
+        (("cameras", "left", "port_distance_m"), 20.0, "0 to 5 m"),
         (("cameras", "left", "normal"), [0.0, 0.0, 1.0, 0.0], "normal"),
         (("cameras", "right", "cam_from_rig", "translation_m"), [0, 0, float("nan")], "right"),
         (("version",), 1, "version"),

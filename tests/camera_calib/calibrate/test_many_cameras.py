@@ -17,7 +17,13 @@ from camera_calib.freedom import POSE, move_rig, part_of_rig
 from camera_calib.lenses.opencv import OpenCVLens
 from camera_calib.rig import Covariance, Rig
 from camera_calib.targets.target import parse_target
-from tests.camera_calib.calibration_scenes import differences, in_air, views_of_some
+from tests.camera_calib.calibration_scenes import (
+    built_rig,
+    differences,
+    in_air,
+    scene,
+    views_of_some,
+)
 from tests.reconstruct import rig_survey
 
 TARGET = parse_target("chessboard 9x6 40mm")
@@ -99,6 +105,23 @@ def test_a_part_of_a_rig_has_the_covariance_of_its_own_poses() -> None:
     assert whole.sigmas == pytest.approx(dict(zip(fields, np.abs(step), strict=True)), rel=1e-9)
 
 
+def test_pictures_of_left_and_right_that_were_exchanged_are_a_warning() -> None:
+    """Without a start by their names, with one by its poses; cameras that are right have none."""
+    truth = in_air(built_rig())
+    views = scene(truth, 12, [1, 2], NOISE_PX, TARGET.points, near_m=0.6, far_m=1.6)
+    sizes = {name: (camera.width_px, camera.height_px) for name, camera in truth.cameras.items()}
+    shown = Detections(sizes=sizes, views=tuple(views), rejections=())
+    crossed = [dict(zip(v.pixels, reversed(v.pixels.values()), strict=True)) for v in views]
+    swapped = [replace(v, pixels=pixels) for v, pixels in zip(views, crossed, strict=True)]
+    exchanged, options = replace(shown, views=tuple(swapped)), CalibrateOptions(lens="k2")
+
+    rig = calibrated(options, shown, None).rig
+    sides = [[w for w in calibrated(options, one, start).warnings if "exchange" in w]
+             for one in (shown, exchanged) for start in (None, rig)]  # fmt: skip
+
+    assert [len(one) for one in sides] == [0, 0, 1, 1]
+
+
 @pytest.mark.slow
 def test_four_lenses_behind_four_ports_are_found_in_air_and_then_in_water() -> None:
     wet, rng = four_cameras(), np.random.default_rng(8)
@@ -129,7 +152,9 @@ def test_four_lenses_behind_four_ports_are_found_in_air_and_then_in_water() -> N
      ({"port": "bow=dome"}, "there is none for left"),
      ({"port": "cube"}, "'cube' for left; choose none, flat, dome"),
      ({"port": "flat,dome"}, "two are for all"),
-     ({"glass_mm": "5,bow=thick"}, "'thick' for bow is not a number from 0 to 500"),
+     ({"glass_mm": "5,bow=thick"}, "'thick' for bow is not a number from 0.5 to 500 mm"),
+     ({"glass_mm": "0.006"}, "'0.006' for left is not a number from 0.5 to 500 mm"),
+     ({"glass_mm": "5", "port_distance_mm": "0.02"}, "'0.02' for left is not .* mm"),
      ({"dome_radius_mm": "80,bow=2"}, "--dome-radius 80,bow=2: '2' for bow is not a number from 5"),
      ({"n_glass": "stern=1.5"}, "--n-glass stern=1.5: no camera is called stern"),
      ({"port_distance_mm": "nan"}, "'nan' for left is not a number"),
