@@ -11,7 +11,7 @@ from scipy.spatial.transform import RigidTransform
 
 from alice_survey.core.artefacts import check_type, read_json, write_json
 from alice_survey.core.config import CameraConfig, WaterConfig
-from alice_survey.core.contents import as_line, in_workspace, one_line
+from alice_survey.core.contents import Location, as_line, in_workspace, one_line
 from alice_survey.core.errors import CalibrationError, warn
 from alice_survey.core.frames import BODY_FROM_NADIR_CAM, Array, pose_from_json, pose_to_json
 from camera_calib.camera import Camera, camera_from_json
@@ -251,7 +251,7 @@ class _RigFile(_FilePart):
     covariance: _StoredCovariance | None = None
 
 
-def read_rig(path: str | Path) -> Rig:
+def read_rig(path: Location) -> Rig:
     """Read `rig.json`, or the calibrated one of a workspace.
 
     Raises:

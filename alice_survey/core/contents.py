@@ -10,6 +10,7 @@ import tomllib
 import zipfile
 import zlib
 from collections.abc import Collection, Iterator, Sequence
+from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree as ET
@@ -23,7 +24,8 @@ if TYPE_CHECKING:
     from pydantic import ValidationError
 
 _SHOWN = 200
-
+Location = str | PathLike[str]
+"""A file or a folder: a path, or a `Survey`, which stands for its workspace."""
 
 MAX_TEXT = 512 << 20
 """Bytes of a text that is read whole."""
@@ -145,7 +147,7 @@ def one_line(error: BaseException) -> str:
     return as_line(str(error)) or type(error).__name__
 
 
-def in_workspace(path: str | Path, within: str) -> Path:
+def in_workspace(path: Location, within: str) -> Path:
     """A file or folder itself, or of a workspace what lies in this place."""
     path, inner = Path(path), Path(path) / within
     return inner if path.is_dir() and (inner.suffix or inner.exists()) else path

@@ -5,14 +5,13 @@ Altitude and all places are of the left port's outer glass.
 
 import math
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 from pydantic import TypeAdapter
 from shapely.errors import ShapelyError
 
 from alice_survey.core.artefacts import read_json
-from alice_survey.core.contents import as_line, in_workspace, one_line
+from alice_survey.core.contents import Location, as_line, in_workspace, one_line
 from alice_survey.core.errors import PlanError
 from alice_survey.core.frames import Datum
 from alice_survey.kit.words import count, duration, share
@@ -228,7 +227,7 @@ class Plan:
         }
 
 
-def read_plan(path: str | Path) -> Plan:
+def read_plan(path: Location) -> Plan:
     """Read `plan.json`, or that of a workspace.
 
     Raises:

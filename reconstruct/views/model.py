@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.core.contents import in_workspace, taken_from
+from alice_survey.core.contents import Location, in_workspace, taken_from
 from alice_survey.core.frames import Array, Datum
 from alice_survey.core.records import CamerasRecord, FrameRecord, PlaceRecord
 from alice_survey.kit.words import count
@@ -177,7 +177,7 @@ def read_warps(path: Path) -> dict[str, PinholeWarp]:
         return {name: warp_from_json(warp) for name, warp in stored.items()}
 
 
-def read_model(sparse: str | Path) -> SparseModel:
+def read_model(sparse: Location) -> SparseModel:
     """Read the model of a finished `sparse/` stage, or of a workspace.
 
     Raises:

@@ -11,7 +11,7 @@ from rasterio.enums import Resampling
 from rasterio.windows import Window
 from scipy.spatial.transform import RigidTransform
 
-from alice_survey.core.contents import in_workspace, taken_from
+from alice_survey.core.contents import Location, in_workspace, taken_from
 from alice_survey.core.frames import Array
 from alice_survey.kit.words import count
 from reconstruct.placing.track import read_track_poses
@@ -119,7 +119,7 @@ class Mosaic(_MapRaster):
         )
 
 
-def read_dem(workspace: str | Path, max_cells: int = 4000) -> Dem:
+def read_dem(workspace: Location, max_cells: int = 4000) -> Dem:
     """Read the surface of a reconstructed workspace.
 
     Args:
@@ -140,7 +140,7 @@ def read_dem(workspace: str | Path, max_cells: int = 4000) -> Dem:
     return Dem(height=height[0].astype(float), sigma=sigma[0].astype(float), **place)
 
 
-def read_mosaic(workspace: str | Path, max_pixels: int = 4000) -> Mosaic:
+def read_mosaic(workspace: Location, max_pixels: int = 4000) -> Mosaic:
     """Read the mosaic of a reconstructed workspace.
 
     Args:
@@ -223,7 +223,7 @@ class Track(_Shown):
         return text
 
 
-def read_track(workspace: str | Path) -> Track:
+def read_track(workspace: Location) -> Track:
     """Read the camera track of a reconstructed workspace.
 
     Args:

@@ -4,7 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from alice_survey.app.api.arrays import Dem, Mosaic, Track
+from alice_survey.app.api.arrays import Dem, Mosaic, Track, read_dem, read_mosaic, read_track
+from alice_survey.core.contents import Location
 from alice_survey.kit.document import EAST_NORTH, OWN_AXES
 from alice_survey.kit.figure import (
     INK,
@@ -17,23 +18,24 @@ from alice_survey.kit.figure import (
     map_axes,
     new_figure,
 )
-from missions.values.plan_file import Plan
+from missions.values.plan_file import Plan, read_plan
 
 _HEIGHT_IN = 5.0
 
 
 @figure_style()
-def plot_plan(plan: Plan) -> Sheet:
+def plot_plan(plan: Plan | Location) -> Sheet:
     """Draw the area, the survey lines and home of a plan, east to the right.
 
     Args:
-        plan: the survey's plan, such as `Survey.plan()` or `read_plan(folder)`; no folder.
+        plan: the survey's plan, or its workspace.
 
     Example:
         >>> import alice_survey as alice
         >>> plan = alice.Survey.new("bay").plan()
         >>> alice.plot_plan(plan).savefig("plan.png")
     """
+    plan = plan if isinstance(plan, Plan) else read_plan(plan)
     sheet, axes = _map()
     shape = Outline.make_compound_path(*(Outline(ring[:, ::-1]) for ring in plan.area.rings_ne))
     axes.add_patch(PathPatch(shape, facecolor="#dceaf3", edgecolor=INK))
@@ -47,16 +49,17 @@ def plot_plan(plan: Plan) -> Sheet:
 
 
 @figure_style()
-def plot_dem(dem: Dem) -> Sheet:
+def plot_dem(dem: Dem | Location) -> Sheet:
     """Draw heights and their standard deviations next to each other.
 
     Args:
-        dem: the surface, such as `Survey.dem` or `read_dem(folder)`; no folder.
+        dem: the surface, or its workspace.
 
     Example:
         >>> import alice_survey as alice
         >>> alice.plot_dem(alice.read_dem("small", max_cells=200)).savefig("dem.png")
     """
+    dem = dem if isinstance(dem, Dem) else read_dem(dem)
     sheet = new_figure(_HEIGHT_IN)
     for axes, values, label in zip(
         sheet.subplots(1, 2),
@@ -76,16 +79,17 @@ def plot_dem(dem: Dem) -> Sheet:
 
 
 @figure_style()
-def plot_mosaic(mosaic: Mosaic) -> Sheet:
+def plot_mosaic(mosaic: Mosaic | Location) -> Sheet:
     """Draw the mosaic with its coordinates and a scale bar.
 
     Args:
-        mosaic: the survey's mosaic, such as `Survey.mosaic` or `read_mosaic(folder)`; no folder.
+        mosaic: the survey's mosaic, or its workspace.
 
     Example:
         >>> import alice_survey as alice
         >>> alice.plot_mosaic(alice.read_mosaic("small", 200)).savefig("mosaic.png")
     """
+    mosaic = mosaic if isinstance(mosaic, Mosaic) else read_mosaic(mosaic)
     sheet, axes = _map()
     axes.imshow(mosaic.rgba, extent=mosaic.extent)
     map_axes(axes, mosaic.unit, names=EAST_NORTH if mosaic.crs is not None else OWN_AXES)
@@ -93,16 +97,17 @@ def plot_mosaic(mosaic: Mosaic) -> Sheet:
 
 
 @figure_style()
-def plot_track(track: Track) -> Sheet:
+def plot_track(track: Track | Location) -> Sheet:
     """Draw where pictures were taken, coloured by the standard deviation of their position.
 
     Args:
-        track: the survey's camera track, such as `Survey.track` or `read_track(folder)`; no folder.
+        track: the survey's camera track, or its workspace.
 
     Example:
         >>> import alice_survey as alice
         >>> alice.plot_track(alice.read_track("small")).savefig("track.png")
     """
+    track = track if isinstance(track, Track) else read_track(track)
     sheet, axes = _map()
     places = track.world_from_cam.translation
     sigma = track.sigma

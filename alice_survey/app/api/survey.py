@@ -4,13 +4,13 @@ import html
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_origin
 
 from alice_survey.app.api.arrays import Dem, Mosaic, Track, read_dem, read_mosaic, read_track
-from alice_survey.core.artefacts import need_stage
+from alice_survey.core.artefacts import need_stage, stage_command
 from alice_survey.core.config import SurveyConfig
 from alice_survey.core.contents import first_fault
-from alice_survey.core.errors import ConfigError, file_faults
+from alice_survey.core.errors import ConfigError, file_faults, warn
 from camera_calib.rig import Rig, design_rig, read_rig
 from missions.values.plan_file import Plan, read_plan
 from reconstruct.views.model import SparseModel, read_model
@@ -46,7 +46,8 @@ def call(command: str, **options: Any) -> Any:
     kind = kinds[command]
     fields = {kind.option_name(one)[2:].replace("-", "_"): one for one in kind.model_fields}
     given = {fields.get(name, name): value for name, value in options.items()}
-    many = {name for name, one in kind.model_fields.items() if "list[" in str(one.annotation)}
+    kinds_of = {n: one.annotation for n, one in kind.model_fields.items()}
+    many = {n for n, one in kinds_of.items() if list in map(get_origin, (one, *get_args(one)))}
     for name in many & {one for one in given if isinstance(given[one], str | float | int | Path)}:
         given[name] = [given[name]]
     try:
@@ -167,8 +168,7 @@ class Survey:
         """State of each stage: up to date, stale (and why), interrupted or missing."""
         from alice_survey.app.pipeline import workspace_status
 
-        states: dict[str, str] = workspace_status(self.folder, None)[1]["stages"]
-        return states
+        return dict(workspace_status(self.folder, None)[1]["stages"])
 
     @property
     def rig(self) -> Rig:
@@ -180,22 +180,37 @@ class Survey:
     @property
     def model(self) -> SparseModel:
         """Registered views and points."""
-        return read_model(need_stage(self.folder, "sparse", "reconstruct"))
+        return read_model(self._made("sparse"))
 
     @property
     def track(self) -> Track:
         """Positions of the pictures, with covariances."""
-        return read_track(need_stage(self.folder, "sparse", "reconstruct"))
+        return read_track(self._made("sparse"))
 
     @property
     def dem(self) -> Dem:
         """Heights of the surface with their sigmas, at most 4,000 cells a side."""
-        return read_dem(need_stage(self.folder, "dense", "reconstruct") / "dem.tif")
+        return read_dem(self._made("dense") / "dem.tif")
 
     @property
     def mosaic(self) -> Mosaic:
         """The orthomosaic, at most 4,000 pixels a side."""
-        return read_mosaic(need_stage(self.folder, "mosaic", "reconstruct") / "mosaic.tif")
+        return read_mosaic(self._made("mosaic") / "mosaic.tif")
+
+    def _made(self, name: str) -> Path:
+        """A folder that `reconstruct` has finished; a warning says that it is out of date."""
+        from alice_survey.app.stages import spec
+
+        folder = need_stage(self.folder, name, "reconstruct")
+        state = self.status()[spec(name).name]
+        if state != "up to date":
+            renews = stage_command("reconstruct", self.folder)
+            warn(f"{folder} is {state}: {renews!r} makes it again")
+        return folder
+
+    def __fspath__(self) -> str:
+        """The folder, so that what takes a workspace takes a survey too."""
+        return str(self.folder)
 
     def _repr_html_(self) -> str:
         rows = "".join(

@@ -14,8 +14,9 @@ from scipy.spatial.transform import RigidTransform
 import alice_survey as alice
 from alice_survey.app.commands.pictures import MeasureCommand
 from alice_survey.app.commands.survey import ReportPageCommand
+from alice_survey.core.errors import keep_warnings
 from reconstruct.views.model import WorldFrame
-from tests.alice_survey.app.report.tiny import write_raster
+from tests.alice_survey.app.report.tiny import tiny_workspace, write_raster
 
 NEEDS_A_MODEL = '"small'
 
@@ -134,6 +135,19 @@ def test_commands_take_the_names_of_their_help_and_readers_a_workspace(tmp_path:
     plan = reef.plan()
     assert alice.read_plan(tmp_path) == alice.read_plan(tmp_path / "plan" / "plan.json") == plan
     assert len(repr(plan)) < 100
+
+
+def test_figures_take_a_survey_and_a_surface_out_of_date_is_a_warning(tmp_path: Path) -> None:
+    tiny = alice.Survey(tiny_workspace(tmp_path))
+    with keep_warnings() as warnings:
+        shown = alice.plot_dem(tiny.dem), alice.plot_mosaic(tiny.mosaic)
+    assert "dense is stale" in warnings[0] and "mosaic is stale" in warnings[1]
+    again = alice.plot_dem(tiny), alice.plot_mosaic(tmp_path)
+    for one, other in zip(shown, again, strict=True):
+        np.testing.assert_array_equal(
+            one.axes[0].images[0].get_array(), other.axes[0].images[0].get_array()
+        )
+    assert alice.plot_plan(tiny).axes[0].get_title(loc="left")
 
 
 def test_the_calls_of_the_page_are_taken(monkeypatch: pytest.MonkeyPatch) -> None:
