@@ -107,6 +107,25 @@ def export_projected(workspace: Path, crs: str) -> tuple[str, dict[str, Any]]:
     return text, {"folder": folder, "crs": name, "vertical_datum": datum}
 
 
+def projected_system(crs: str) -> pyproj.CRS:
+    """What the text of `--crs` names.
+
+    Raises:
+        ConfigError: it is no projected system in metres.
+    """
+    try:
+        found = pyproj.CRS.from_user_input(crs)
+    except pyproj.exceptions.CRSError:
+        raise ConfigError(f"--crs {crs}: unknown; write it as EPSG:32636") from None
+    flat = found.is_projected and not found.is_compound
+    if not flat or any(axis.unit_name != "metre" for axis in found.axis_info):
+        raise ConfigError(
+            f"--crs {crs}: {found.name} is not a projected system in metres, horizontal alone: "
+            "take the UTM zone, such as EPSG:32636; heights stay as they are"
+        )
+    return found
+
+
 def destination(crs: str, frame: WorldFrame) -> Destination:
     """A projected system that products of a frame go to.
 
@@ -119,16 +138,7 @@ def destination(crs: str, frame: WorldFrame) -> Destination:
             f"the model has no place in the world, so that it has none in {crs}: import navigation "
             "with positions, or control points"
         )
-    try:
-        found = pyproj.CRS.from_user_input(crs)
-    except pyproj.exceptions.CRSError:
-        raise ConfigError(f"--crs {crs}: unknown; write it as EPSG:32636") from None
-    flat = found.is_projected and not found.is_compound
-    if not flat or any(axis.unit_name != "metre" for axis in found.axis_info):
-        raise ConfigError(
-            f"--crs {crs}: {found.name} is not a projected system in metres, horizontal alone: "
-            f"take the UTM zone, such as EPSG:32636; heights stay above {frame.vertical_datum}"
-        )
+    found = projected_system(crs)
     area, datum = found.area_of_use, frame.datum
     if area is not None and is_beyond(area, datum.latitude_deg, datum.longitude_deg):
         warn(

@@ -370,6 +370,7 @@ def only_one(workspace: Path) -> Iterator[None]:
     """Lock the workspace so that no second run writes into it."""
     refuse_links(workspace, workspace / ".lock")
     lock = FileLock(workspace / ".lock", timeout=0)
+    is_new = not workspace.exists()
     with file_faults(workspace, WorkspaceError, "written"):
         workspace.mkdir(parents=True, exist_ok=True)
         try:
@@ -379,4 +380,7 @@ def only_one(workspace: Path) -> Iterator[None]:
     try:
         yield
     finally:
+        if is_new and list(workspace.iterdir()) == [workspace / ".lock"]:  # nothing came of it
+            Path(lock.lock_file).unlink()
+            workspace.rmdir()
         lock.release()

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from alice_survey.core.artefacts import refuse_links, write_csv
+from alice_survey.core.artefacts import refuse_links, stage_command, write_csv
 from alice_survey.core.block_solver import MAD_TO_SIGMA
 from alice_survey.core.errors import ImageError, why
 from alice_survey.core.executor import Executor
@@ -284,6 +284,9 @@ def quality_report(workspace: Path, executor: Executor) -> tuple[str, dict[str, 
     """
     refuse_links(workspace, workspace / "quality")
     images = workspace / "images"
+    if not images.is_dir():
+        first = stage_command("import-images", workspace)
+        raise ImageError(f"{images} is not there yet; run {first!r} first")
     records = read_manifest(images / "manifest.csv")
     if not records:
         raise ImageError(f"{images / 'manifest.csv'} names no picture")

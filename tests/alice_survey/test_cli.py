@@ -25,6 +25,7 @@ from alice_survey.app.pipeline import init_survey, run
 from alice_survey.app.stages import names
 from alice_survey.core.config import CameraConfig, WaterConfig, load_config
 from alice_survey.core.errors import (
+    AliceError,
     ConfigError,
     ImageError,
     PlanError,
@@ -226,6 +227,23 @@ def test_commands_that_are_offered_work_where_names_hold_spaces(
     for line in (*ways, *again, *after, *empty, *real):
         parse(line)
     assert min(map(len, (ways, empty))) >= 2
+
+
+def test_a_run_that_fails_at_once_leaves_no_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "photos").mkdir()
+    Image.new("RGB", (64, 48)).save(tmp_path / "photos" / "0.png")
+    for line in (
+        "import-images none -w dive", "reconstruct none -o dive", "quality -w dive",
+        "reconstruct photos -o dive --crs none", "import-images photos --rig none.json -w dive",
+        "import-images photos --navigation none.csv -w dive",
+    ):  # fmt: skip
+        done = CliRunner().invoke(app, line.split())
+        assert isinstance(done.exception, AliceError), line
+        assert not (tmp_path / "dive").exists(), line
+        assert "none" in str(done.exception) or offered(str(done.exception))
 
 
 def test_every_command_that_the_packages_name_is_one() -> None:

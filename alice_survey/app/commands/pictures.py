@@ -265,6 +265,10 @@ class ReconstructCommand(DeviceCommand):
         """Run the stages, then write for other programs."""
         from alice_survey.app.pipeline import run, stage_states
 
+        if self.crs is not None:
+            from reconstruct.export import export_projected, projected_system
+
+            projected_system(self.crs)  # before hours of work
         stages, workspace = self.stages(), self.output or self.workspace
         if self.output is not None:
             if self.output.resolve() == self.workspace.resolve():
@@ -284,8 +288,6 @@ class ReconstructCommand(DeviceCommand):
                     more, values[self.export] = export_copies(workspace)
                 text = f"{text}\n{more}"
         if self.crs is not None:
-            from reconstruct.export import export_projected
-
             more, values["crs"] = export_projected(workspace, self.crs)
             text = f"{text}\n{more}"
         if stage_states(workspace, self.settings())["report"].startswith("stale"):
