@@ -24,7 +24,14 @@ from alice_survey.core.config import (
     parse_config,
     settings_in,
 )
-from alice_survey.core.errors import ConfigError, WorkspaceError, file_faults, offer, warn
+from alice_survey.core.errors import (
+    ConfigError,
+    WorkspaceError,
+    collected_by,
+    file_faults,
+    offer,
+    warn,
+)  # fmt: skip
 from alice_survey.core.executor import Executor, local_executor
 from alice_survey.core.run import progress
 from alice_survey.core.settings_form import settings_template
@@ -89,7 +96,8 @@ def run(
     if "placing" in stages and (control := workspace / "control.csv").is_file():
         from reconstruct.placing.control_points import read_control
 
-        read_control(control)
+        with collected_by(lambda *_: None):  # the stage warns
+            read_control(control)
 
     def say_result(stage: StageSpec, folder: Path) -> None:
         text = stage.summary(folder)[0].replace(str(folder), str(workspace / stage.folder))

@@ -377,7 +377,11 @@ def test_pictures_become_a_report_in_one_command(
     assert f"alice-survey report -w {dive}" in done.output.splitlines()[-1]
 
 
-def test_control_is_read_before_the_pictures(tmp_path: Path) -> None:
-    (tmp_path / "control.csv").write_text("kind,name,use\npoint,A,perhaps\n")
+def test_control_is_read_before_the_pictures(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What it warns of, its stage reports."""
+    (tmp_path / "control.csv").write_text("kind,name,use,colour\npoint,A,perhaps,red\n")
     with pytest.raises(WorkspaceError, match="line 2"):
         run(["mapping", "placing"], tiny_workspace(tmp_path), None)
+    assert "colour" not in capsys.readouterr().err
