@@ -147,7 +147,6 @@ def run_mapping(
         ReconstructionError: the pictures give no model.
     """
     inputs = read_inputs(workspace)
-    pycolmap.logging.minloglevel = 2  # its own account of every step is for its developers
     (folder / "features").mkdir(parents=True, exist_ok=True)
     mounted = rig_with_mount(inputs.rig)
     pictures = [

@@ -20,6 +20,7 @@ from alice_survey.core.frames import Array
 from camera_calib.approximation.pinhole_warp import PinholeWarp
 from reconstruct.matching.features import Features, load_features
 
+pycolmap.logging.minloglevel = 3  # its own account of every step is for its developers
 Matches = NDArray[np.uint32]
 SIFT_RATIO = 0.8
 """Largest distance of a match over that of the second nearest descriptor of SIFT."""

@@ -145,3 +145,9 @@ def test_where_the_largest_features_agree_on_nothing_all_are_compared(tmp_path: 
     save_features(task.second, b)
     found = matches.match_pair(task).matches
     assert len(found) >= 1300 and found.min() >= 1500
+
+
+def test_what_colmap_logs_is_not_shown(capfd: pytest.CaptureFixture[str]) -> None:
+    """Also in processes that only match; a fault of its own comes as an exception."""
+    pycolmap.logging.error("a step did not work out")
+    assert capfd.readouterr().err == ""
