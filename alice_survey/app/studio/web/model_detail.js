@@ -128,5 +128,5 @@ export function startDetail(scene, root, {errorPx, load, drop, progress, failed}
     draw();
   }
 
-  return {group, update, moved() { coarser = 1; }, clear() { held.forEach(forget); }};
+  return {group, update, moved() { coarser = 1; }};
 }

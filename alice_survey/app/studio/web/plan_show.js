@@ -33,10 +33,10 @@ export function shown(studio) {
   const {map} = studio;
   const off = new Set(["plan-footprints"]);
   const away = new Set();
-  let [names, stations, number, active, last, whole] =
-    [new Set(), null, 0, false, null, null];
+  let [names, stations, number, active, last, whole] = [new Set(), null, 0, false, null, null];
   let textAt = (_) => "";
   map.moreAt((place) => (active ? textAt(place) : ""));
+  const lookAt = (extent) => { map.extend(extent); map.fit(false); };
 
   function put(about) {
     names.add(about.name);
@@ -144,8 +144,7 @@ export function shown(studio) {
       bounds.getEast()];
     const margin = 0.04 * Math.max(north - south, east - west, 1);
     whole = [west - margin, south - margin, east + margin, north + margin];
-    map.extend(whole);
-    map.fit(false);
+    lookAt(whole);
   }
 
   /* The plan as it was made is put away while the one in work is shown. */
@@ -159,7 +158,7 @@ export function shown(studio) {
 
   function enter() {
     active = true;
-    if (whole) map.extend(whole);
+    if (whole) lookAt(whole);
     alone();
     show(last);
   }
@@ -175,7 +174,7 @@ export function shown(studio) {
     stations?.remove();
     stations = null;
     active = false;
-    map.extend(map.data.extent);
+    lookAt(map.data.extent);
     away.forEach((name) => map.show(name, true));
     away.clear();
   }

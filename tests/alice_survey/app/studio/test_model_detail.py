@@ -65,8 +65,7 @@ async function seen([e, n, up]) {
 }
 const views = [];
 for (const place of PLACES) views.push(await seen(place));
-detail.clear();
-console.log(JSON.stringify({views, loads, drops, failures, left: detail.group.children.length}));
+console.log(JSON.stringify({views, loads, drops, failures}));
 """
 
 
@@ -101,7 +100,6 @@ def test_only_what_the_view_needs_is_loaded(tmp_path: Path) -> None:
     assert found["loads"][0] == "r"
     assert len(found["loads"]) == len(set(found["loads"])) < 20  # of 85
     assert not any(name.startswith("r3") for name in west["drawn"])
-    assert found["left"] == 0 and sorted(found["drops"]) == sorted(found["loads"])
 
 
 @pytest.mark.parametrize("known", [False, True])

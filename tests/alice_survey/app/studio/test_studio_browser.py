@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from alice_survey.app.pipeline import init_survey
 from tests.alice_survey.app.report.tiny import tiny_workspace, write_raster
 from tests.alice_survey.app.studio.journey_page import opened_page
 from tests.alice_survey.kit.browser import is_accessible
@@ -74,6 +75,20 @@ def test_the_map_loads_tiles_and_zooms(folder: Path) -> None:
         for name in ("Mosaic", "Sigma of height", "Height") * 3:  # faster than tiles come
             page.get_by_label(name, exact=True).check()
         page.get_by_role("button", name="Show all").click()
+
+
+def test_a_model_is_shown_whole_again_after_a_larger_plan(folder: Path) -> None:
+    init_survey(folder)
+    with opened_page(folder) as (page, _):
+        before = float(page.locator(MAP).get_attribute("data-zoom"))
+        zooms = []
+        for _again in range(2):
+            page.get_by_role("tab", name="Plan", exact=True).click()
+            page.wait_for_selector("#panel-plan[data-plans]", timeout=60_000)
+            zooms.append(float(page.locator(MAP).get_attribute("data-zoom")))
+            page.get_by_role("tab", name="Model", exact=True).click()
+            assert float(page.locator(MAP).get_attribute("data-zoom")) == before
+        assert zooms[0] == zooms[1] < before - 2.0
 
 
 @pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (400, "light"), (1280, "dark")])
