@@ -486,7 +486,8 @@ def run_studio(
     ahead = threading.Thread(target=_compile_ahead, args=(server.studio,), daemon=True)
     ahead.start()
     try:
-        show(f"{workspace} is shown at {server.address} to this machine alone; Ctrl-C ends it")
+        new = "" if workspace.is_dir() else " (not there yet)"
+        show(f"{workspace}{new} is shown at {server.address} to this machine alone; Ctrl-C ends it")
         if browser:
             import webbrowser
 
