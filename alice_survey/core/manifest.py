@@ -5,7 +5,7 @@ Pictures enter a reconstruction through `images/manifest.csv` only, never by a f
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -121,3 +121,9 @@ def read_manifest(path: Path) -> list[ImageRecord]:
         if Path(inside).is_absolute() or ".." in Path(inside).parts:
             raise ImageError(f"{path}: {inside!r} leaves its folder")
     return records
+
+
+def stored_name(image: str, images: Collection[str]) -> str:
+    """A picture's name in the manifest: as given, or of the one that differs in its case alone."""
+    alike = [image] if image in images else [n for n in images if n.lower() == image.lower()]
+    return alike[0] if len(alike) == 1 else image

@@ -28,7 +28,7 @@ from alice_survey.core.errors import (
     warn,
 )
 from alice_survey.core.frames import Array, Datum
-from alice_survey.core.manifest import ImageRecord
+from alice_survey.core.manifest import ImageRecord, stored_name
 from alice_survey.core.records import MappingRecord, PicturesRecord, ScaleRecord
 from alice_survey.core.run import progress
 from camera_calib.rig import rig_with_mount
@@ -483,7 +483,10 @@ def picks_of_model(workspace: Path, images: Collection[str], known: Collection[s
     """
     files = [workspace / name for name in (PICKS_FILE, MARKERS_FILE)]
     read = (pick for path in files if path.is_file() for pick in read_picks(path))
-    picks = [pick for pick in read if controls(pick.point, known)]
+    picks = [
+        replace(pick, image=stored_name(pick.image, images))
+        for pick in read if controls(pick.point, known)
+    ]  # fmt: skip
     if not picks:
         warn(
             f"{CONTROL_FILE} is not used: no point is picked in {PICKS_FILE} or {MARKERS_FILE}: "

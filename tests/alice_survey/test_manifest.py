@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from alice_survey.core.errors import ImageError
-from alice_survey.core.manifest import read_manifest
+from alice_survey.core.manifest import read_manifest, stored_name
 from tests.refusals import refused
 
 HEAD = "image,camera,station,mask,time_s\n"
@@ -32,3 +32,10 @@ def test_wrong_rows_are_one_line(row: str, tmp_path: Path) -> None:
     with refused(ImageError, path) as fault:
         read_manifest(path)
     assert len(str(fault.value)) < 400
+
+
+def test_a_name_in_another_case_is_that_of_the_one_picture_which_it_fits() -> None:
+    images = ["left/a.png", "left/A.png", "left/IMG_1.JPG"]
+    asked = ["left/a.png", "Left/img_1.jpg", "left/img_1.png", "LEFT/A.PNG"]
+    found = ["left/a.png", "left/IMG_1.JPG", "left/img_1.png", "LEFT/A.PNG"]
+    assert [stored_name(image, images) for image in asked] == found

@@ -563,6 +563,7 @@ def test_what_controls_nothing_is_no_input(tmp_path: Path) -> None:
     known = depends()
     assert {p.name for p in {*known[1]} - {*before[1]}} == {"control.csv"}
     assert [p.point for p in picks_of_model(tmp_path, ["0.png"], {"7"})] == ["7.0"]
+    assert [p.image for p in picks_of_model(tmp_path, ["0.PNG"], {"7"})] == ["0.PNG"]
     rows = [f"{rows[0]}mine", *rows[1:6], "1.png,c,1,1,1,", "0.png,7.1,,,,"]
     picks.write_text("\n".join([header, *rows]))
     assert depends() == known
