@@ -30,6 +30,7 @@ from alice_survey.kit.words import (
     share,
     sigma_length,
 )
+from reconstruct.stages import rig_file
 
 _SURE_SIGMAS = 3.0
 """Sigmas from which a difference is significant."""
@@ -135,6 +136,15 @@ def _model(held: Held) -> Iterator[Verdict]:
         sag = length_with_sigma(worst.sag_m, worst.sag_sigma_m)
         text = f"bend of the model against navigation: {sag} over {length(worst.length_m)}"
         yield Verdict(level="good", text=f"{text}, so none is seen")
+    if rig_file(held.workspace) is None:
+        control = held.read(ControlRecord)
+        outside = "navigation" if bends else "control" if control and control.points else ""
+        yield _verdict(
+            "lens: found from these pictures alone, and no sigma counts its error; "
+            + (f"{outside} checks the shape" if outside else "nothing else checks the shape"),
+            "Calibrate the camera in the water ('alice-survey calibrate'), or add control points.",
+            good=bool(outside),
+        )
 
 
 def _scale(held: Held) -> Iterator[Verdict]:

@@ -8,7 +8,9 @@ from alice_survey.app.report.held import Held
 from alice_survey.app.report.verdicts import facts, summary, verdicts
 from alice_survey.app.stages import spec
 from alice_survey.core.artefacts import write_json
+from alice_survey.core.config import SurveyConfig
 from alice_survey.kit.document import Verdict
+from camera_calib.rig import design_rig, write_rig
 from tests.alice_survey.app.report.tiny import tiny_workspace
 
 
@@ -54,6 +56,19 @@ def test_a_model_is_judged_and_the_next_step_named(
     held, found = judged(tiny_workspace(tmp_path, sparse=sparse))
     assert level_of(found, words) == level
     assert next_step in summary(held, found)["What to do next"]
+
+
+def test_a_lens_of_the_survey_itself_needs_a_check_from_outside(tmp_path: Path) -> None:
+    workspace = tiny_workspace(tmp_path)
+    assert level_of(judged(workspace)[1], "lens: ") == "look"
+    point = {"name": "A", "use": "check", "misfit_sigmas": 1.0, "views": 3}
+    point |= dict.fromkeys(("north_m", "east_m", "down_m"), 0.01)
+    control = {"points": [point], "bars": [], "not_found": {}, "rms": {}}
+    write_json(workspace / "sparse" / "control.json", control)
+    assert level_of(judged(workspace)[1], "lens: ") == "good"
+    config = SurveyConfig()
+    write_rig(workspace / "images" / "rig.json", design_rig(config.camera, config.water))
+    assert not any("lens: " in verdict.text for verdict in judged(workspace)[1])
 
 
 def test_a_scale_of_navigation_beyond_reason_has_few_digits(tmp_path: Path) -> None:
