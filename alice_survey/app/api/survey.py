@@ -13,6 +13,7 @@ from alice_survey.core.contents import first_fault
 from alice_survey.core.errors import ConfigError, file_faults, warn
 from camera_calib.rig import Rig, design_rig, read_rig
 from missions.values.plan_file import Plan, read_plan
+from reconstruct.stages import rig_file
 from reconstruct.views.model import SparseModel, read_model
 
 
@@ -47,7 +48,7 @@ def call(command: str, **options: Any) -> Any:
     fields = {kind.option_name(one)[2:].replace("-", "_"): one for one in kind.model_fields}
     given = {fields.get(name, name): value for name, value in options.items()}
     kinds_of = {n: one.annotation for n, one in kind.model_fields.items()}
-    many = {n for n, one in kinds_of.items() if list in map(get_origin, (one, *get_args(one)))}
+    many = {n for n, of in kinds_of.items() if list in [get_origin(k) for k in (of, *get_args(of))]}
     for name in many & {one for one in given if isinstance(given[one], str | float | int | Path)}:
         given[name] = [given[name]]
     try:
@@ -172,40 +173,38 @@ class Survey:
 
     @property
     def rig(self) -> Rig:
-        """The calibrated rig, or the rig as designed where none has been calibrated."""
-        path = self.folder / "calibration" / "rig.json"
-        config = self.config
-        return read_rig(path) if path.is_file() else design_rig(config.camera, config.water)
+        """The rig as calibrated or imported, or as designed where there is neither."""
+        path, config = rig_file(self.folder), self.config
+        return design_rig(config.camera, config.water) if path is None else read_rig(path)
 
     @property
     def model(self) -> SparseModel:
         """Registered views and points."""
-        return read_model(self._made("sparse"))
+        return read_model(self._folder_of("sparse"))
 
     @property
     def track(self) -> Track:
         """Positions of the pictures, with covariances."""
-        return read_track(self._made("sparse"))
+        return read_track(self._folder_of("sparse"))
 
     @property
     def dem(self) -> Dem:
         """Heights of the surface with their sigmas, at most 4,000 cells a side."""
-        return read_dem(self._made("dense") / "dem.tif")
+        return read_dem(self._folder_of("dense") / "dem.tif")
 
     @property
     def mosaic(self) -> Mosaic:
         """The orthomosaic, at most 4,000 pixels a side."""
-        return read_mosaic(self._made("mosaic") / "mosaic.tif")
+        return read_mosaic(self._folder_of("mosaic") / "mosaic.tif")
 
-    def _made(self, name: str) -> Path:
+    def _folder_of(self, name: str) -> Path:
         """A folder that `reconstruct` has finished; a warning says that it is out of date."""
         from alice_survey.app.stages import spec
 
         folder = need_stage(self.folder, name, "reconstruct")
         state = self.status()[spec(name).name]
         if state != "up to date":
-            renews = stage_command("reconstruct", self.folder)
-            warn(f"{folder} is {state}: {renews!r} makes it again")
+            warn(f"{folder} is {state}: {stage_command('reconstruct', self.folder)!r} renews it")
         return folder
 
     def __fspath__(self) -> str:

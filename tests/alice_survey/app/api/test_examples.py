@@ -147,6 +147,10 @@ def test_figures_take_a_survey_and_a_surface_out_of_date_is_a_warning(tmp_path: 
         np.testing.assert_array_equal(
             one.axes[0].images[0].get_array(), other.axes[0].images[0].get_array()
         )
+    config = alice.SurveyConfig()
+    bare = alice.design_rig(config.camera, config.water, scale=4)
+    alice.write_rig(tmp_path / "images" / "rig.json", bare)
+    assert tiny.rig.cameras["left"].width_px == bare.cameras["left"].width_px
     assert alice.plot_plan(tiny).axes[0].get_title(loc="left")
 
 
