@@ -343,7 +343,6 @@ def _write_undistorted(workspace: Path, executor: Executor, folder: Path) -> Non
             "frame": model.frame.name,
             "unit": model.frame.unit,
             "vertical_datum": model.frame.vertical_datum,
-            "axes_of_sparse": ["north", "east", "down"],
             "pictures": len(done),
             "on_surface": {
                 names[view.image]: round(on_surface, 4)

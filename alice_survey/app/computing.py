@@ -289,6 +289,5 @@ def summary(
             f"{digits(here['disk_mb'] / 1e3, 2)} GB of disk"
         )
     if lines and ran:
-        found |= {"measured_over_predicted": round(ratio, 3), "corrected_by": round(factor, 3)}
         lines[-1] += f"; corrected by {factor:.2f}, since {', '.join(ran)} took {ratio:.2f} of it"
     return "\n".join(lines), found

@@ -58,10 +58,6 @@ class Raster:
             return 1.0, self.unit
         return (1e3, "mm") if self.small and length == "m" else (1.0, length)
 
-    def band_text(self, length: str, over: str) -> str:
-        """Description of its band."""
-        return self.band.format(unit=length, over=over)
-
 
 DEM = Raster(
     file="dense/dem.tif", title="Height", unit=LENGTH, band="height {over}",

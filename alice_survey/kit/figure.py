@@ -173,22 +173,20 @@ def draw_figure(
     paint: Callable[[Sequence[Any]], None],
     height_in: float,
     *,
-    columns: int = 1,
     width_in: float = WIDTH_IN,
     **words: Any,
 ) -> Figure:
-    """A report's figure from a function that paints on a row of axes.
+    """A report's figure from a function that paints on a list of axes, the only one.
 
     Args:
-        paint: draws on axes, from left to right.
+        paint: draws on the axes.
         height_in: inches.
-        columns: how many axes.
         width_in: inches.
         words: title, alt, shows, good and otherwise of the figure.
     """
     with figure_style():
         sheet = new_figure(height_in, width_in)
-        paint(list(sheet.subplots(1, columns, squeeze=False)[0]))
+        paint([sheet.subplots()])
         return Figure(png=png_of(sheet), svg=svg_of(sheet), **words)
 
 

@@ -152,16 +152,16 @@ def calibrate_task(task: CalibrationTask, found: Detections) -> Calibration:
 
 def _opposite(rig: Rig, start: Rig | None) -> Iterator[str]:
     """A warning of each camera that lies opposite to where the start, or its name, places it."""
-    first = rig.reference
-    for name in list(rig.cameras)[1:]:
+    first, *others = rig.cameras
+    for name in others:
         place = rig.cam_from_rig[name].inv().translation
-        aside = np.array([1.0, 0.0, 0.0]) * ((first, name) == ("left", "right"))
-        expected = aside if start is None else start.cam_from_rig[name].inv().translation
+        expected = np.array([1.0, 0.0, 0.0]) * ((first, name) == ("left", "right"))
+        if start is not None:
+            expected = start.cam_from_rig[name].inv().translation
         if place @ expected < -0.5 * np.linalg.norm(place) * np.linalg.norm(expected):
-            way = f"to the left of {first}" if start is None else "opposite to where --start has it"
             yield (
-                f"{name} is {1e3 * np.linalg.norm(place):.4g} mm {way}: exchange the pictures of "
-                f"{first} and {name}, unless the cameras are upside down"
+                f"{name} lies opposite to where {'its name' if start is None else '--start'} has "
+                f"it from {first}: exchange their pictures, unless both are upside down"
             )
 
 
@@ -173,9 +173,9 @@ def _check_sizes(task: CalibrationTask, found: Detections) -> None:
     """
     for name, camera in ({} if task.start is None else task.start.cameras).items():
         if (camera.width_px, camera.height_px) != found.sizes[name]:
-            width, height = found.sizes[name]
+            size = " x ".join(map(str, found.sizes[name]))
             raise CalibrationError(
-                f"pictures of {name} have {width} x {height} px, the start's camera "
+                f"pictures of {name} have {size} px, the start's camera "
                 f"{camera.width_px} x {camera.height_px}"
             )
 

@@ -72,18 +72,13 @@ def write_report(folder: Path, calibration: Calibration, held_out: HeldOut | Non
         "baselines_m": judged.baselines_m,
         "pictures": judged.pictures,
         "cameras": {
-            name: {
-                "coverage": camera.coverage,
-                "residuals_by_incidence_deg": camera.by_incidence,
-                "homography": camera.homography,
-            }
+            name: {"coverage": camera.coverage, "homography": camera.homography}
             for name, camera in judged.cameras.items()
         },
         "stereo": judged.stereo,
         "lengths": _length_numbers(judged.lengths),
         "held_out": judged.hold_out,
         "halves": judged.halves,
-        "held_out_lengths": _length_numbers(judged.held_lengths),
     }
     CalibrationReportRecord.save(folder / "report.json", json_values(data))
     cameras = " and ".join(judged.cameras) if len(judged.cameras) < 3 else f"{len(judged.cameras)}"

@@ -182,10 +182,8 @@ def print_target(text: str, path: Path, paper: str | None) -> tuple[str, dict[st
         )
     data = {
         "file": str(path),
-        "target_file": str(described),
         "target": target.to_json(),
         "page_mm": [round(sheet.width_mm, 3), round(sheet.height_mm, 3)],
         "points": len(target.points),
-        "ambiguous": target.is_ambiguous,
     }
     return "\n".join(lines), data

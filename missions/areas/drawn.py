@@ -149,13 +149,7 @@ def area_settings(
 
 
 def drawing_of_file(
-    path: Path,
-    settings: AreaConfig,
-    *,
-    role: Role = "survey",
-    layer: str | None = None,
-    crs: str | None = None,
-    datum: Datum | None,
+    path: Path, settings: AreaConfig, *, role: Role = "survey", datum: Datum | None
 ) -> AreaDrawing:
     """The shapes of a file, to be drawn.
 
@@ -163,15 +157,13 @@ def drawing_of_file(
         path: of a kind that areas are read from.
         settings: of the area so far.
         role: what the shapes are for.
-        layer: of a file with several.
-        crs: of a file that does not say.
         datum: that they count to; None: the middle of the file, or the datum so far where the file
             is in metres.
 
     Raises:
         PlanError: the file cannot be read, or lies too far from the datum.
     """
-    raw = read_area_file(path, layer, crs, role=role)
+    raw = read_area_file(path, None, None, role=role)
     if datum is None:
         datum = middle(raw) if raw.geographic else area_drawing(settings).datum
     frame = LocalFrame(datum=datum, seafloor_depth_m=settings.seafloor_depth_m, datum_is_given=True)

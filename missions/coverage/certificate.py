@@ -140,7 +140,6 @@ class Certificate:
             "cameras": list(self.cameras),
             "stations": self.stations,
             "pictures": self.taken,
-            "stations_without_sea_floor": self.blind,
             "asked_for": {
                 "lines": self.pattern.passes,
                 "pictures_of_each_camera": self.pattern.passes * self.pattern.pictures,

@@ -321,7 +321,7 @@ def flight_summary(flight: Flight, vehicle: VehicleConfig, rig: Rig) -> dict[str
     on_line = ~np.isnan(cross)
     following = flown.report[:, PHASE] == FOLLOW
     turning = following & ~on_line
-    roll, pitch = np.abs(np.rad2deg(flight.attitude_rad[:, :2])).T
+    roll = np.abs(np.rad2deg(flight.attitude_rad[:, 0]))
     off = flight.log.position_ned - flight.truth.ned_from_body.translation
     speed = np.linalg.norm(true_velocity(flown)[:, :2], axis=1)
     energy_wh = flown.energy_j / 3600.0
@@ -356,7 +356,6 @@ def flight_summary(flight: Flight, vehicle: VehicleConfig, rig: Rig) -> dict[str
             "heading_rms_deg": _rms(np.rad2deg(heading[on_line])),
             "roll_rms_deg": _rms(roll[on_line]),
             "roll_worst_deg": _worst(roll[on_line]),
-            "pitch_rms_deg": _rms(pitch[on_line]),
             "speed_mean_mps": float(speed[on_line].mean()) if on_line.any() else None,
             "altitude_rms_m": _rms(flight.altitude_m[on_line] - plan.altitude_m),
             "altitude_least_m": float(flight.altitude_m[on_line].min()) if on_line.any() else None,

@@ -2,7 +2,7 @@
 
 The plan is JSON values for a page. All totals are those of the plan itself. Only the certificate of
 a large area is counted on a coarser grid (`MAX_CELLS`): the shares that it gives, and the holes,
-are then estimates, and `certificate.estimated` says so.
+are then estimates.
 """
 
 import base64
@@ -226,10 +226,6 @@ def _plan_json(planned: Planned, rig: Rig) -> dict[str, Any]:
         },
         "outline": np.round(footprint_outline(plan, rig), 4).tolist(),
         "counts": _counts_json(seen),
-        "certificate": {
-            "cell_m": seen.grid.cell_m,
-            "estimated": seen.estimated,
-        },
         "holes": _holes(seen),
         "profile": _profile(plan, planned.bathymetry),
         "rows": [

@@ -243,7 +243,7 @@ def _write_rasters(
                     frame,
                     one.dtype,
                     float("nan") if one.dtype == "float32" else None,
-                    one.band_text(frame.unit, over),
+                    one.band.format(unit=frame.unit, over=over),
                     frame.unit if one.unit == LENGTH else one.unit,
                     threads,
                 )

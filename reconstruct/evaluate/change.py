@@ -82,9 +82,6 @@ class Change:
     regions: tuple[Region, ...]
     """Largest volume first."""
     cell: float
-    noise_area: float
-    """Area over which errors are correlated: the variance of a mean over a larger area A is the
-    variance of a cell times this over A."""
     registration_sigma: float
     """Median over the cells."""
 
@@ -114,10 +111,8 @@ class Change:
         unchanged = {
             "share_significant": np.mean(np.abs(ratio) > SIGNIFICANT),
             "difference_over_sigma_rms": rms(ratio),
-            "median_mm": np.median(level),
             "robust_sigma_mm": MAD_TO_SIGMA * np.median(np.abs(level)),
             "registration_sigma_mm": 1e3 * self.registration_sigma,
-            "errors_go_together_over_mm": 1e3 * np.sqrt(self.noise_area),
         }
         return figures | {
             "regions": [region.to_json() for region in self.regions],
@@ -174,7 +169,6 @@ def find_change(now: Elevation, before: Elevation, fit: HeightFit) -> Change:
         changed=changed,
         regions=tuple(sorted(regions, key=lambda r: -abs(r.volume_m3))),
         cell=now.cell,
-        noise_area=noise_area,
         registration_sigma=float(np.nanmedian(registration)),
     )
 
@@ -235,7 +229,8 @@ def _follow(
         free: (h, w) where no other place is.
         maps: (3, h, w) difference, its sigma, and the share of the registration in it.
         cell: side of a cell.
-        noise_area: see `Change`.
+        noise_area: over which errors are correlated: the variance of a mean over a larger area A is
+            the variance of a cell times this over A.
     """
     difference, sigma, registration = maps
     away = cv2.distanceTransform((~inside).astype(np.uint8), cv2.DIST_L2, 5)
@@ -425,7 +420,6 @@ def _change_registration(fit: HeightFit, georeferenced: Any) -> dict[str, Any]:
         "shift_sigma_mm": [round(1e3 * float(v), 4) for v in sigma[3:]],
         "turn_deg": [round(float(v), 5) for v in np.rad2deg(moved.rotation.as_rotvec())],
         "turn_sigma_deg": [round(float(v), 6) for v in np.rad2deg(sigma[:3])],
-        "spread_mm": round(1e3 * fit.spread, 4),
         "cells": fit.used,
     }
 

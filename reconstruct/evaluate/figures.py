@@ -185,6 +185,5 @@ def compare_lengths(found: Array, true: Array, rng: np.random.Generator) -> dict
         "points": len(found),
         "scale_error_ppm": round(1e6 * float(lengths @ truth / (truth @ truth) - 1), 1),
         "rms_mm": round(1e3 * rms(error), 3),
-        "rms_ppm_of_length": round(1e6 * rms(error / np.maximum(truth, 1e-9)), 1),
         "mean_length_m": round(float(truth.mean()), 3),
     }

@@ -409,7 +409,6 @@ class CloudDistances:
         figures: dict[str, Any] = {
             "points": len(away),
             "covered_share": round(self.covered_share, 4),
-            "median_signed_m": json_number(float(np.median(self.signed_m)), 5),
             "nearest_point_median_m": json_number(float(np.median(self.nearest_m)), 5),
         }
         for name, value in (

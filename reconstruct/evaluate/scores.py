@@ -91,7 +91,6 @@ class SurfaceScore:
                 "median": json_number(median(ratio), 3),
                 "robust": json_number(MAD_TO_SIGMA * median(np.abs(ratio)), 3),
                 "within_1_sigma": json_number(float(np.mean(np.abs(ratio) < 1)), 4),
-                "within_2_sigma": json_number(float(np.mean(np.abs(ratio) < 2)), 4),
                 "median_sigma_mm": json_number(1e3 * median(self.sigma_m[stated]), 3),
             },
         }
@@ -252,7 +251,6 @@ class MosaicScore:
             "pixel_mm": round(1e3 * self.pixel_m, 4),
             "coverage": round(self.coverage, 4),
             "patches": self.patches,
-            "clear_patches": len(self.shifts_m),
             "clear_share": round(len(self.shifts_m) / max(self.patches, 1), 4),
         }
         if len(self.shifts_m):

@@ -87,8 +87,6 @@ def mesh_facts(
         "area": round(float(area.sum()), 6),
         "textured_share": round(float(area[textured.label >= 0].sum() / area.sum()), 6),
         "pages": len(textured.pages),
-        "texture_scale": round(textured.scale, 6),
-        "decimation_error": mesh.error,
         "unit": frame.unit,
         "frame": frame.name,
         "vertical_datum": frame.vertical_datum,

@@ -72,8 +72,6 @@ class TriangleMesh:
     vertices: Array
     """(V, 3) vertices in the coordinates of the cloud."""
     triangles: Triangles
-    error: float
-    """Error of the decimation, in the unit of the vertices."""
 
 
 def mesh_cloud(
@@ -98,7 +96,7 @@ def mesh_cloud(
     levels = [finest_level(cloud, step, error, folder, executor)]
     while levels[-1].triangles > _MAX_TRIANGLES and len(levels[-1].cells) > 1:
         levels.append(coarser_level(levels, step, folder, executor))
-    whole, error = levels[-1].whole(), levels[-1].error
+    whole = levels[-1].whole()
     vertices = whole.vertices
     triangles = without_pairs(whole.triangles)
     triangles = triangles[find_unfolded(vertices, triangles)]
@@ -110,7 +108,7 @@ def mesh_cloud(
             "thinly to carry a surface; the pictures need more overlap or sharper texture"
         )
     vertices, triangles, _ = split_fans(vertices, triangles[large])
-    return TriangleMesh(vertices=vertices, triangles=triangles, error=error), levels
+    return TriangleMesh(vertices=vertices, triangles=triangles), levels
 
 
 def finest_level(

@@ -365,7 +365,6 @@ def paint_plane(painting: Painting, plane: Plane, dem: Path, folder: Path) -> bo
             "unit": model.frame.unit,
             "frame": model.frame.name,
             "covered": covered,
-            "coverage_cell": grid.cell * CELL_PX,
             "vertical_datum": model.frame.vertical_datum,
             "colour": reconstruct.colour,
             **colour.to_json(),
@@ -480,10 +479,9 @@ def _dispersion(
         reason = "rendered pictures have none"
     if reason:
         return None, {"corrected": False, "reason": reason}
-    stated = config.temperature_c is not None and config.salinity_psu is not None
     values = {
         "temperature_c": _TEMPERATURE_C if config.temperature_c is None else config.temperature_c,
         "salinity_psu": _SALINITY_PSU if config.salinity_psu is None else config.salinity_psu,
     }
     water = Water(depth_m=depth_m, **values)
-    return water, {"corrected": True, **values, "water_stated": stated}
+    return water, {"corrected": True, **values}

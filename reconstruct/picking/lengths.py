@@ -16,7 +16,7 @@ out knows less, never more.
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -471,7 +471,8 @@ def measure(
         raise ReconstructionError(f"the model has no scale: lengths are not metres; run {after!r}")
     finder = _PickFinder(workspace, pictures)
     picks = [finder.find(some) for some in marks]
-    lines: list[PolylineFigure] = [(partial(_segment, n), 1) for n in range(len(picks) - 1)]
+    segments = [lambda p, n=n: polyline(p[n : n + 2]) for n in range(len(picks) - 1)]
+    lines: list[PolylineFigure] = [(segment, 1) for segment in segments]
     if len(picks) > 2:
         lines += [(polyline, 1), (polygon_area, 2)]
     places, figures = Lengths(workspace, pictures).figures(picks, lines)
@@ -590,11 +591,6 @@ class _PickFinder:
 
 def _text(pick: Pick) -> str:
     return f"{pick.image}:{pick.x_px - 0.5:g},{pick.y_px - 0.5:g}"
-
-
-def _segment(number: int, points: Array) -> float:
-    """Length of one segment of the line through points."""
-    return polyline(points[number : number + 2])
 
 
 def _describe(

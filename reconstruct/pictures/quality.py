@@ -285,8 +285,7 @@ def quality_report(workspace: Path, executor: Executor) -> tuple[str, dict[str, 
     refuse_links(workspace, workspace / "quality")
     images = workspace / "images"
     if not images.is_dir():
-        first = stage_command("import-images", workspace)
-        raise ImageError(f"{images} is not there yet; run {first!r} first")
+        raise ImageError(f"no {images}: run {stage_command('import-images', workspace)!r} first")
     records = read_manifest(images / "manifest.csv")
     if not records:
         raise ImageError(f"{images / 'manifest.csv'} names no picture")

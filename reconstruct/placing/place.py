@@ -483,10 +483,8 @@ def picks_of_model(workspace: Path, images: Collection[str], known: Collection[s
     """
     files = [workspace / name for name in (PICKS_FILE, MARKERS_FILE)]
     read = (pick for path in files if path.is_file() for pick in read_picks(path))
-    picks = [
-        replace(pick, image=stored_name(pick.image, images))
-        for pick in read if controls(pick.point, known)
-    ]  # fmt: skip
+    own = (pick for pick in read if controls(pick.point, known))
+    picks = [replace(pick, image=stored_name(pick.image, images)) for pick in own]
     if not picks:
         warn(
             f"{CONTROL_FILE} is not used: no point is picked in {PICKS_FILE} or {MARKERS_FILE}: "

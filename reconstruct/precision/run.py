@@ -224,7 +224,15 @@ def precision_report(
     }  # fmt: skip
     if measures:
         options = [*single_measures(base), with_control(base)]
-        data["measures"] = [_measure_json(base, one) for one in options]
+        data["measures"] = [
+            {
+                "measure": one.name,
+                "minutes": one.minutes - base.minutes,
+                "bend_gain_m_per_minute": None if one.with_control else gain_per_minute(base, one),
+                **to_json(one.precision),
+            }
+            for one in options
+        ]
         gains = [row["bend_gain_m_per_minute"] for row in data["measures"]]
         table = [
             [one.name, f"{one.minutes - base.minutes:+.1f}", *_cells(one.precision),
@@ -247,17 +255,6 @@ def to_json(found: Precision) -> dict[str, Any]:
         "heights_rms_m": found.heights_rms_m,
         "stations_shape_rms_m": _rms(found.shape_m),
         "stations_shape_worst_m": float(np.linalg.norm(found.shape_m, axis=1).max()),
-        "stations_place_rms_m": np.sqrt((found.place_m**2).mean(axis=0)).tolist(),
-    }
-
-
-def _measure_json(base: Candidate, one: Candidate) -> dict[str, Any]:
-    return {
-        "measure": one.name,
-        "minutes": one.minutes - base.minutes,
-        "bend_gain_m": worst_bend(base.precision) - worst_bend(one.precision),
-        "bend_gain_m_per_minute": None if one.with_control else gain_per_minute(base, one),
-        **to_json(one.precision),
     }
 
 

@@ -240,21 +240,19 @@ def revisit_report(
 def _json(found: Found, cures: Sequence[Prediction]) -> dict[str, Any]:
     places = [place.to_json() for place in found.places]
     for place, cure in zip(places, cures, strict=False):
-        place |= {"predicted_left": round(cure.left, 4), "predicted": cure.text}
+        place |= {"predicted": cure.text}
     return {
         "plan": found.plan.name,
         "registered": found.record.registered,
         "pictures": found.record.total,
         "models": list(found.record.models),
         "stations": len(found.pictured.good),
-        "stations_spoilt": len(found.pictured.spoilt),
         "share_at_overlap": found.seen.share_at_overlap,
         "covered_share": found.seen.covered_share,
         "asked_for": {
             "lines": found.pattern.passes,
             "pictures_of_each_camera": found.pattern.passes * found.pattern.pictures,
             "sigma_mm": round(1e3 * found.sigma_goal_m, 4),
-            "tracks_of_a_part": round(found.least_tracks, 2),
         },
         "weak_m2": round(sum(place.area_m2 for place in found.places), 6),
         "places": places,

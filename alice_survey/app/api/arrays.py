@@ -19,16 +19,8 @@ from reconstruct.raster import opened_raster
 from reconstruct.views.model import WorldFrame, read_frame
 
 
-class _Shown:
-    """What a notebook shows as its title and text."""
-
-    def _repr_html_(self) -> str:
-        title, _, text = repr(self).partition(": ")
-        return f"<b>{title}</b>: {text}"
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _MapRaster(_Shown):
+class _MapRaster:
     west: float
     """Left edge, in the raster's coordinates (metres where the model is scaled)."""
     north: float
@@ -181,7 +173,7 @@ def _read(path: Path, bands: list[int], maximum: int) -> tuple[Any, dict[str, An
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
-class Track(_Shown):
+class Track:
     """Positions of the registered pictures, with their covariances.
 
     Example:

@@ -111,7 +111,7 @@ def test_pictures_of_left_and_right_that_were_exchanged_are_a_warning() -> None:
     views = scene(truth, 12, [1, 2], NOISE_PX, TARGET.points, near_m=0.6, far_m=1.6)
     sizes = {name: (camera.width_px, camera.height_px) for name, camera in truth.cameras.items()}
     shown = Detections(sizes=sizes, views=tuple(views), rejections=())
-    crossed = [dict(zip(v.pixels, reversed(v.pixels.values()), strict=True)) for v in views]
+    crossed = [dict(zip(v.pixels, [*v.pixels.values()][::-1], strict=True)) for v in views]
     swapped = [replace(v, pixels=pixels) for v, pixels in zip(views, crossed, strict=True)]
     exchanged, options = replace(shown, views=tuple(swapped)), CalibrateOptions(lens="k2")
 

@@ -102,13 +102,11 @@ class TakenPictures:
         with self._lock:  # of several that request it, one decodes
             if key not in self._kept:
                 self._kept[key] = read_colour(self.path(name))
-                while len(self._kept) > 1 and self._bytes() > _MAX_BYTES:
+                kept = self._kept.values()
+                while len(kept) > 1 and sum(picture.nbytes for picture in kept) > _MAX_BYTES:
                     self._kept.popitem(last=False)
             self._kept.move_to_end(key)
             return self._kept[key]
-
-    def _bytes(self) -> int:
-        return sum(picture.nbytes for picture in self._kept.values())
 
     def grey(self, name: str) -> NDArray[np.uint8]:
         """(H, W) as taken; see `colour`."""

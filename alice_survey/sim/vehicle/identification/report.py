@@ -385,10 +385,9 @@ def _fit_data(fit: OutputErrorFit) -> dict[str, Any]:
         for i, j in itertools.combinations(range(len(names)), 2)
         if math.isfinite(matrix[i, j]) and abs(matrix[i, j]) > _HIGH_CORRELATION
     ]
-    sigma, shares = map(_or_none, fit.channel_sigma), 100.0 * fit.closer[:, :_MOTIONS]
+    shares = 100.0 * fit.closer[:, :_MOTIONS]
     return {
         "high_correlations": sorted(pairs, key=lambda pair: -abs(pair["correlation"])),
-        "residual_sigma": dict(zip(CHANNEL_NAMES, sigma, strict=True)),
         "closer_percent": _motions(shares[0]),
         "closer_percent_sigma": _motions(shares[1]),
         "prior": None if fit.prior is None else asdict(fit.prior),
