@@ -27,7 +27,6 @@ def test_totals_and_warnings_are_those_of_the_plan() -> None:
         assert totals[name] == getattr(plan, name)
     assert totals["at_overlap"] == plan.coverage
     assert found["warnings"] == list(made.warnings) and found["warnings"]
-    assert not found["certificate"]["estimated"]
     dives = [line["dive"] for line in found["lines"]]
     assert dives == sorted(dives)
     for way, dive in zip(found["routes"], plan.dives, strict=True):
