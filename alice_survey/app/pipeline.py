@@ -24,14 +24,7 @@ from alice_survey.core.config import (
     parse_config,
     settings_in,
 )
-from alice_survey.core.errors import (
-    ConfigError,
-    WorkspaceError,
-    collected_by,
-    file_faults,
-    offer,
-    warn,
-)  # fmt: skip
+from alice_survey.core.errors import ConfigError, WorkspaceError, file_faults, offer, warn
 from alice_survey.core.executor import Executor, local_executor
 from alice_survey.core.run import progress
 from alice_survey.core.settings_form import settings_template
@@ -94,6 +87,7 @@ def run(
     from alice_survey.app.computing import task_memory_mib
 
     if "placing" in stages and (control := workspace / "control.csv").is_file():
+        from alice_survey.core.errors import collected_by
         from reconstruct.placing.control_points import read_control
 
         with collected_by(lambda *_: None):  # the stage warns

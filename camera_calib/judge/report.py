@@ -97,9 +97,9 @@ def write_report(folder: Path, calibration: Calibration, held_out: HeldOut | Non
 def _length_numbers(lengths: LengthErrors | None) -> dict[str, Any] | None:
     if lengths is None:
         return None
-    (scale, sigma), (rms, expected) = lengths.scale_ppm(), lengths.rms_m()
+    (scale, _), (rms, expected) = lengths.scale_ppm(), lengths.rms_m()
     long = {"count": len(lengths.view), "rms_m": rms, "expected_m": expected}
-    return {"scale_ppm": scale, "scale_sigma_ppm": sigma, "long": long}
+    return {"scale_ppm": scale, "long": long}
 
 
 def _facts(judged: Judgement) -> Iterator[tuple[str, str]]:

@@ -330,7 +330,6 @@ def run_dense(
         {
             "format": "alice-survey surface",
             "version": 1,
-            "depth_scale": scales.depth,
             "matching_scale": scales.matching,
             "match_sigma_px": match_sigma_px,
             "sigma_factor": round(sigma_factor, 3),

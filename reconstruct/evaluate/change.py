@@ -417,7 +417,6 @@ def _change_registration(fit: HeightFit, georeferenced: Any) -> dict[str, Any]:
     sigma = np.sqrt(np.maximum(np.diag(fit.covariance), 0.0))
     return {
         "shift_east_north_up_m": [round(float(v), 5) for v in shift],
-        "shift_sigma_mm": [round(1e3 * float(v), 4) for v in sigma[3:]],
         "turn_deg": [round(float(v), 5) for v in np.rad2deg(moved.rotation.as_rotvec())],
         "turn_sigma_deg": [round(float(v), 6) for v in np.rad2deg(sigma[:3])],
         "cells": fit.used,

@@ -277,7 +277,7 @@ def evaluate_reference(
         free_scale = not model.frame.scaled or _NAVIGATION in source
     rng = np.random.default_rng(1)
     own = read_own_cloud(workspace)
-    theirs, placed = read_reference(reference, model.frame.datum)
+    theirs, _ = read_reference(reference, model.frame.datum)
     surface = ReferenceSurface.of(theirs)
     start = first_placement(own, surface)
     fit = register_cloud(own, surface, start, free_scale=free_scale, rng=rng)
@@ -290,7 +290,6 @@ def evaluate_reference(
         "format": "alice-survey reference",
         "version": 1,
         "reference": str(reference),
-        "reference_has_coordinate_system": placed,
         "ground_pixel_m": json_number(pixel_m, 6),
         "registration": {
             "transform": "similarity" if free_scale else "rigid",

@@ -142,10 +142,8 @@ class ColourModel:
     def to_json(self) -> dict[str, Any]:
         """What was found, for `mosaic.json`."""
         values = {
-            "white_blue_green_red": self.light.white,
             "fall_off_per_unit_blue_green_red": self.light.fall_off,
             "fall_off_sigma_blue_green_red": self.light.fall_off_sigma,
-            "black_blue_green_red": self.black,
             "middle_range": float(self.light.middle_range),
         }
         if self.water is not None:
@@ -153,7 +151,6 @@ class ColourModel:
                 "added_light_share_blue_green_red": self.water.share,
                 "added_light_share_sigma_blue_green_red": self.water.share_sigma,
                 "spread": self.water.spread,
-                "added_light_growth_per_unit_blue_green_red": self.water.growth,
             }
         found: dict[str, Any] = json_values(values)
         return found

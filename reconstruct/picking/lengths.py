@@ -29,7 +29,6 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from alice_survey.core.contents import read_arrays
 from alice_survey.core.errors import ReconstructionError, offer
 from alice_survey.core.frames import Array
-from alice_survey.core.manifest import stored_name
 from alice_survey.core.records import MappingRecord, RegistrationRecord, ScaleRecord
 from alice_survey.kit.words import digits, with_sigma
 from camera_calib.rig import Rig, read_rig
@@ -550,8 +549,6 @@ class _PickFinder:
             ReconstructionError: one is outside of its picture, meets no known surface, or no other
                 picture shows it.
         """
-        names = self._pictures.names
-        picks = [replace(pick, image=stored_name(pick.image, names)) for pick in picks]
         for pick in picks:
             width, height = self._pictures.warp(pick.image).size_px
             if not (0 <= pick.x_px <= width and 0 <= pick.y_px <= height):

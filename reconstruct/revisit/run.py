@@ -249,11 +249,6 @@ def _json(found: Found, cures: Sequence[Prediction]) -> dict[str, Any]:
         "stations": len(found.pictured.good),
         "share_at_overlap": found.seen.share_at_overlap,
         "covered_share": found.seen.covered_share,
-        "asked_for": {
-            "lines": found.pattern.passes,
-            "pictures_of_each_camera": found.pattern.passes * found.pattern.pictures,
-            "sigma_mm": round(1e3 * found.sigma_goal_m, 4),
-        },
         "weak_m2": round(sum(place.area_m2 for place in found.places), 6),
         "places": places,
     }

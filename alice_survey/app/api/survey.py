@@ -202,8 +202,7 @@ class Survey:
         from alice_survey.app.stages import spec
 
         folder = need_stage(self.folder, name, "reconstruct")
-        state = self.status()[spec(name).name]
-        if state != "up to date":
+        if (state := self.status()[spec(name).name]) != "up to date":
             warn(f"{folder} is {state}: {stage_command('reconstruct', self.folder)!r} renews it")
         return folder
 

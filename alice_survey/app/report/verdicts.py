@@ -137,13 +137,12 @@ def _model(held: Held) -> Iterator[Verdict]:
         text = f"bend of the model against navigation: {sag} over {length(worst.length_m)}"
         yield Verdict(level="good", text=f"{text}, so none is seen")
     if rig_file(held.workspace) is None:
-        control = held.read(ControlRecord)
-        outside = "navigation" if bends else "control" if control and control.points else ""
+        checked = bool(bends or held.read(ControlRecord))
         yield _verdict(
-            "lens: found from these pictures alone, and no sigma counts its error; "
-            + (f"{outside} checks the shape" if outside else "nothing else checks the shape"),
+            "lens: found from these pictures alone, and no sigma counts its error"
+            + "; navigation or control checks the shape" * checked,
             "Calibrate the camera in the water ('alice-survey calibrate'), or add control points.",
-            good=bool(outside),
+            good=checked,
         )
 
 
