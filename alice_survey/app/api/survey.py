@@ -46,11 +46,11 @@ def call(command: str, **options: Any) -> Any:
         raise ConfigError(f"there is no command {command!r}: one of {', '.join(sorted(kinds))}")
     kind = kinds[command]
     fields = {kind.option_name(one)[2:].replace("-", "_"): one for one in kind.model_fields}
-    given = {fields.get(name, name): value for name, value in options.items()}
+    given = {fields.get(n, n): v.folder if isinstance(v, Survey) else v for n, v in options.items()}
     kinds_of = {n: one.annotation for n, one in kind.model_fields.items()}
     many = {n for n, of in kinds_of.items() if list in [get_origin(k) for k in (of, *get_args(of))]}
-    for name in many & {one for one in given if isinstance(given[one], str | float | int | Path)}:
-        given[name] = [given[name]]
+    single = {n for n in many & {*given} if isinstance(given[n], str | float | int | Path)}
+    given |= {name: [given[name]] for name in single}
     try:
         result = kind(**given).run()
     except ValidationError as error:

@@ -139,6 +139,7 @@ def test_commands_take_the_names_of_their_help_and_readers_a_workspace(tmp_path:
 
 def test_figures_take_a_survey_and_a_surface_out_of_date_is_a_warning(tmp_path: Path) -> None:
     tiny = alice.Survey(tiny_workspace(tmp_path))
+    assert alice.call("status", workspace=tiny)["stages"] == tiny.status()
     with keep_warnings() as warnings:
         shown = alice.plot_dem(tiny.dem), alice.plot_mosaic(tiny.mosaic)
     assert "dense is stale" in warnings[0] and "mosaic is stale" in warnings[1]
