@@ -35,7 +35,7 @@ from reconstruct.adjustment.normal_equations import (
     pattern_of,
 )
 from reconstruct.mapping.arrays import Indices, frames_of, observations, rig_poses
-from reconstruct.mapping.bundle import cauchy_weights
+from reconstruct.mapping.bundle import robust_weights
 from reconstruct.mapping.database import Observations
 from reconstruct.mapping.mapper import Mapped
 
@@ -420,7 +420,7 @@ def _weigh(
 ) -> LinearObservations:
     sigma, variance = noise
     found = exact_observations(state, pixels, fields)
-    root = np.sqrt(cauchy_weights(found.miss, sigma) / variance)[:, None, None]
+    root = np.sqrt(robust_weights(found.miss, sigma) / variance)[:, None, None]
     for slopes in (found.by_point, found.rest):  # in place: a copy takes longer than all else
         slopes *= root
     return found

@@ -65,7 +65,7 @@ from reconstruct.mapping.arrays import (
     observations,
     rig_poses,
 )
-from reconstruct.mapping.bundle import cauchy_weights, sigma_of, variance_of
+from reconstruct.mapping.bundle import robust_weights, sigma_of, variance_of
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.views.model_files import as_transform
 
@@ -450,7 +450,7 @@ def estimate(
     parts = PixelParts(pixels, len(frames), workers)
     miss = np.nan_to_num(parts.residuals(state), nan=0.0)
     sigma = sigma_of(miss, pixels.seen_by, len(frames))
-    weights = cauchy_weights(miss, sigma)
+    weights = robust_weights(miss, sigma)
     variance = variance_of(miss, weights, spare / (2 * count))
     linear = linearise_parts(parts, state, (), (sigma, variance))
     shape = shape_of_block(

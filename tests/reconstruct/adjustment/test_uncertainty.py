@@ -30,7 +30,7 @@ from reconstruct.adjustment.survey_fit import (
     shift_information,
 )
 from reconstruct.mapping.arrays import cross_matrices, frames_of, observations
-from reconstruct.mapping.bundle import cauchy_weights
+from reconstruct.mapping.bundle import robust_weights
 from reconstruct.mapping.mapper import Mapped
 from reconstruct.mapping.refraction import adjust_freely
 from reconstruct.placing.alignment import align_rigid, align_similarity, level
@@ -364,7 +364,7 @@ def hessian_of(survey: AdjustedSurvey) -> Array:
     fit = survey.exact.fit
     pixels = exact_survey(survey.exact.mapped, survey.exact.seen, fit.calibrated)[0]
     linear = linearised(fit.state, pixels, fit.parameters)
-    weights = cauchy_weights(linear.miss, fit.sigma_px)
+    weights = robust_weights(linear.miss, fit.sigma_px)
     count = len(fit.state.centres)
     hessian, _ = dense_normal_equations(
         linear.weigh(weights / weights.mean() / fit.sigma_px**2), count

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import integrate
 
-from reconstruct.mapping.bundle import cauchy_weights, pixel_sigma, sigma_of, variance_of
+from reconstruct.mapping.bundle import pixel_sigma, robust_weights, sigma_of, variance_of
 from reconstruct.mapping.refraction import adjust_freely
 from tests.reconstruct.mapping.test_mapper import camera_rms, mapped_scene
 from tests.reconstruct.scenes import Scene, make_scene
@@ -30,15 +30,15 @@ def test_a_tenth_of_wrong_observations_hardly_moves_the_sigma() -> None:
 
 def test_normal_residuals_keep_their_variance_and_most_of_their_efficiency() -> None:
     residuals = np.random.default_rng(2).normal(0, 0.3, (200_000, 2))
-    weights = cauchy_weights(residuals, 0.3)
+    weights = robust_weights(residuals, 0.3)
     scaled = variance_of(residuals, weights, 1.0) / weights.mean()
 
-    def of(power: int) -> float:  # mean of weight^2 times (r / sigma)^(2 power) over the plane
-        density = lambda e: np.exp(-e) * (1 + 2 * e / 2.385**2) ** -2 * e**power  # noqa: E731
+    def of(power: int) -> float:  # mean of weight^power times half of (r / sigma)^2 over the plane
+        density = lambda e: np.exp(-e) * (1 + 2 * e / 4.096**2) ** (-2 * power) * e  # noqa: E731
         return float(integrate.quad(density, 0, 60)[0])
 
-    efficiency = of(0) ** 2 / of(1)
-    assert 0.93 < efficiency < 0.95
+    efficiency = of(1) ** 2 / of(2)  # the mean slope by Stein's identity
+    assert efficiency == pytest.approx(0.95, abs=1e-3)
     assert scaled == pytest.approx(0.3**2 / efficiency, rel=0.02)
 
 
