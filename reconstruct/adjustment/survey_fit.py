@@ -75,9 +75,10 @@ from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.refraction import Keypoints
 from reconstruct.views.model_files import colmap_pinhole, rigid3d, stored_of
 
-BIAS_PX = 0.02
-"""Sigma of the shift of keypoints, root mean square over a picture: 0.004 for each polynomial. In
-rendered surveys the largest are 0.001 behind flat ports and 0.006 with a fisheye."""
+BIAS_PX = 0.04
+"""Sigma of the shift of keypoints, root mean square over a picture: 0.006 for each polynomial. In
+rendered surveys the largest of these are 0.001 behind flat ports and 0.007 with a fisheye, where a
+line is flown again in the other direction and the lamps come from the other side."""
 
 
 def shift_information(state: RigState) -> Array:
