@@ -37,7 +37,7 @@ from reconstruct.dense.cloud import cloud_in_parts, frame_comments
 from reconstruct.evaluate.scores import read_mesh
 from reconstruct.mesh.formats import write_obj
 from reconstruct.mesh.visibility import ray_scene
-from reconstruct.pictures.undistorted import Pictures
+from reconstruct.pictures.undistorted import Pictures, show_at
 from reconstruct.raster import BLOCK, local_crs, opened_raster, small_cache, tiles_of_shape
 from reconstruct.stages import DENSE, MESH, MOSAIC, PLACING
 from reconstruct.views.model import View, WorldFrame, points_of_views, read_frame, read_model
@@ -383,7 +383,7 @@ def export_view(workspace: Path, folder: Path, task: tuple[View, float]) -> floa
     taken = pictures.as_taken(view.image)
     inside = (x >= 0) & (x <= taken.shape[1] - 1) & (y >= 0) & (y <= taken.shape[0] - 1)
     x, y = np.where(inside, x, np.float32(-10.0)), np.where(inside, y, np.float32(-10.0))
-    colour = cv2.remap(taken, x, y, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
+    colour = show_at(taken, x, y)
     usable = pictures.usable(view.image)
     if usable is not None:
         inside &= cv2.remap(usable.astype(np.uint8), x, y, cv2.INTER_NEAREST) > 0

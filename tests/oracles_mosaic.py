@@ -2,25 +2,11 @@
 
 import itertools
 import math
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from alice_survey.core.frames import Array
-
-
-def lanczos_at(picture: Array, x: float, y: float) -> Array:
-    """One place of `sample_lanczos`, in a picture of light (H, W, 3)."""
-
-    def weights(t: NDArray[Any]) -> Array:
-        return np.where(np.abs(t) < 4, np.sinc(t) * np.sinc(t / 4), 0.0)
-
-    rows, columns = (math.floor(at) + np.arange(-3, 5) for at in (y, x))
-    shares = np.outer(weights(y - rows), weights(x - columns))
-    height, width = picture.shape[:2]
-    part = picture[np.clip(rows, 0, height - 1)][:, np.clip(columns, 0, width - 1)]
-    return np.maximum(np.tensordot(shares, part) / shares.sum(), 0.0)
 
 
 def labels_energy(number: Array, share: Array, colours: Array, chosen: NDArray[np.int32]) -> float:

@@ -267,12 +267,13 @@ def draw(look: Look, onto: Look) -> Array:
     x, y, depth = look.view.show_in(onto.view, pixels, look.depth[rows, columns]).T
     x, y = np.floor(x / onto.step - 0.5), np.floor(y / onto.step - 0.5)
     height, width = onto.shape
-    found = np.full(height * width, np.inf)
-    for right, down in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        inside = (x >= -right) & (x < width - right) & (y >= -down) & (y < height - down)
-        cell = ((y[inside] + down) * width + x[inside] + right).astype(np.int64)
-        np.minimum.at(found, cell, depth[inside])
-    return np.where(np.isfinite(found), found, np.nan).reshape(height, width)
+    inside = (x >= -1) & (x < width) & (y >= -1) & (y < height)
+    cell = ((y[inside] + 1) * (width + 1) + x[inside] + 1).astype(np.int64)
+    found = np.full((height + 1) * (width + 1), np.inf)
+    np.minimum.at(found, cell, depth[inside])  # of cells whose right and lower ones are drawn too
+    found = np.minimum(*(found.reshape(height + 1, -1)[n : n + height] for n in range(2)))
+    found = np.minimum(found[:, :-1], found[:, 1:])
+    return np.where(np.isfinite(found), found, np.nan)
 
 
 def shared_depth(stack: Float32, stations: NDArray[np.int64], tolerance: float) -> Float32:

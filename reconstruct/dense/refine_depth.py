@@ -26,6 +26,7 @@ from scipy import ndimage
 from alice_survey.core.block_solver import MAD_TO_SIGMA
 from alice_survey.core.compiled import compiled
 from alice_survey.core.frames import Array
+from reconstruct.pictures.undistorted import spline_weights
 from reconstruct.views.model import View
 from reconstruct.views.range_shift import FAST, KernelLens, line_of, warped_at
 
@@ -123,31 +124,6 @@ def pixel_lines(lens: KernelLens, height: int, width: int, top: int = 0) -> Floa
     return lines
 
 
-_SIXTH, _HALF, _TWO_THIRDS = np.float32(1 / 6), np.float32(0.5), np.float32(2 / 3)
-_ONE, _THREE_HALVES, _TWO = np.float32(1.0), np.float32(1.5), np.float32(2.0)
-_Weights = tuple[np.float32, np.float32, np.float32, np.float32]
-
-
-@compiled(error_model="numpy", fastmath=FAST)
-def _spline(t: np.float32) -> tuple[_Weights, _Weights]:
-    """The weights of a cubic B-spline at a share t of the way from the second node, and slopes."""
-    s = _ONE - t
-    u, v = _HALF * t - _ONE, _HALF * s - _ONE
-    weights = (
-        _SIXTH * s * s * s,
-        t * t * u + _TWO_THIRDS,
-        s * s * v + _TWO_THIRDS,
-        _SIXTH * t * t * t,
-    )
-    slopes = (
-        -_HALF * s * s,
-        (_THREE_HALVES * t - _TWO) * t,
-        (_TWO - _THREE_HALVES * s) * s,
-        _HALF * t * t,
-    )
-    return weights, slopes
-
-
 @compiled(error_model="numpy", fastmath=FAST)
 def compare(
     share: Share, inverse_depth: Float32, reference: Float32, lines: Float32, spline: Float32,
@@ -200,8 +176,8 @@ def compare(
             if not (valid[i, j] and valid[i + 1, j + 1] and valid[i, j + 1] and valid[i + 1, j]):
                 continue
             p, q = np.float32(u - j), np.float32(v - i)
-            (a0, a1, a2, a3), (b0, b1, b2, b3) = _spline(p)
-            across, changes = _spline(q)
+            (a0, a1, a2, a3), (b0, b1, b2, b3) = spline_weights(p)
+            across, changes = spline_weights(q)
             value, right, down = np.float32(0.0), np.float32(0.0), np.float32(0.0)
             for m in range(4):
                 k = i - 1 + m

@@ -288,13 +288,14 @@ def run_dense(
 
     prepare = partial(prepare_view, workspace)
     _drain(executor.map(prepare, tasks([()] * len(views)), label="even out pictures"))
-    matched = ((task, points.of(task.index)) for task in tasks(pairs_once(partners)))
-    match, looks = partial(match_view, matching), tasks(partners)
+    order = sorted(range(len(views)), key=lambda n: views[n].station)  # neighbours stay prepared
+    once, looks = tasks(pairs_once(partners)), tasks(partners)
+    match, matched = partial(match_view, matching), ((once[n], points.of(n)) for n in order)
     _drain(executor.map(match, matched, label="match", total=len(views)))
     probes = [looks[n] for n in choose_probes(partners)]
     match_sigma_px = find_match_sigma(matching, probes, executor)
     refine = partial(refine_view, matching, match_sigma_px, on_gpu=executor.uses_gpu)
-    _drain(executor.map(refine, looks, label="refine"))
+    _drain(executor.map(refine, [looks[n] for n in order], label="refine"))
     checks = tasks(neighbours(model, _CHECKING))
     sigma_factor = find_sigma_factor(checks, executor)
     check = partial(check_view, sigma_factor)

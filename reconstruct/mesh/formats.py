@@ -15,14 +15,15 @@ from numpy.typing import NDArray
 from alice_survey.core.artefacts import atomic_path
 from alice_survey.core.frames import Array
 from alice_survey.core.run import progress
-from reconstruct.mesh.texture import Textured, read_page, remap
+from reconstruct.mesh.texture import Textured, remap
 from reconstruct.mesh.topology import face_normals, vertex_normals
 from reconstruct.mesh.visibility import ray_scene
+from reconstruct.pictures.undistorted import read_colour
 
 _LINEAR, _MIPMAPS, _CLAMP = 9729, 9987, 33071
 _UNLIT = "KHR_materials_unlit"
 GLB_AXES = "x = east, y = up, z = -north (y up, as glTF has it)"
-_WIDTH_PX = 1600
+_WIDTH_PX = 1200
 _SAMPLES = 2
 """Rays a pixel along either axis."""
 _ELEVATION_DEG, _AZIMUTH_DEG = 40.0, 200.0
@@ -135,7 +136,7 @@ def render_oblique(mesh: Textured) -> NDArray[np.uint8]:
     y = low[1] + (np.arange(rows) + 0.5) * side
     corners = mesh.wedges.vertex[mesh.wedges.triangles].astype(np.int32)
     scene, normals = ray_scene((mesh.vertices, corners)), face_normals(mesh.vertices, corners)
-    pages = [read_page(page) for page in mesh.pages]
+    pages = [read_colour(page) for page in mesh.pages]
     picture = np.empty((rows, columns, 3), np.uint8)
     for top in range(0, rows, _ROWS):
         across = y[top : top + _ROWS, None, None] * down + (low[2] - side) * forward

@@ -168,14 +168,6 @@ def make_texture(
     )
 
 
-def read_page(path: Path) -> NDArray[np.uint8]:
-    """A picture that `write_jpeg` wrote, BGR."""
-    picture = cv2.imread(str(path))
-    if picture is None:
-        raise FileNotFoundError(path)
-    return np.asarray(picture, np.uint8)
-
-
 def write_jpeg(path: Path, picture: NDArray[np.uint8]) -> None:
     """Write a BGR picture without thinning its colours."""
     flags = [

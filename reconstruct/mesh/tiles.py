@@ -40,7 +40,6 @@ from reconstruct.mesh.texture import (
     Textured,
     make_texture,
     nearest_covered,
-    read_page,
     remap,
     spread_corners,
     wedge_pixels,
@@ -54,6 +53,7 @@ from reconstruct.mesh.visibility import (
     ray_scene,
     to_world,
 )
+from reconstruct.pictures.undistorted import read_colour
 from reconstruct.views.model import View, WorldFrame
 
 REGION_LEVEL = 2
@@ -347,7 +347,7 @@ def _colours_next_to(
         with np.load(skin) as data:
             parts.append((data["vertices"] - middle, data["triangles"]))
             uv.append(data["uv"])
-        page = read_page(skin.with_suffix(".jpg"))
+        page = read_colour(skin.with_suffix(".jpg"))
         pages.append(cv2.resize(page, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
     found = ray_scene(*parts).compute_closest_points(o3d.core.Tensor(points), 1)
     owner = found["geometry_ids"].numpy()

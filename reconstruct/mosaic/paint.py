@@ -32,16 +32,12 @@ from reconstruct.mosaic.visibility import (
     Water,
     camera_optics,
     channel_optics,
-    lanczos_weights,
-    sample_lanczos,
     see,
 )
-from reconstruct.pictures.undistorted import Pictures
+from reconstruct.pictures.undistorted import SPLINE_REACH, Pictures, sample_spline, spline_nodes
 from reconstruct.raster import small_cache
 from reconstruct.views.model import View, enu_from_cam
 
-_CACHED_BYTES = 100_000_000
-"""Pictures as taken that each process keeps."""
 _SMALL_COPIES = 40
 """Small copies of pictures that each process keeps."""
 
@@ -70,14 +66,12 @@ class Tools:
     def __init__(self, survey: MosaicSetup) -> None:
         self._pictures = Pictures.still(survey.workspace)
         self.small = lru_cache(maxsize=_SMALL_COPIES)(partial(read_small, survey.scratch))
-        self.usable = self._pictures.usable
-        """Mask of a picture as taken."""
+        self.picture, self.usable = self._pictures.as_taken, self._pictures.usable
+        """A picture as taken, and its mask."""
         self.table = linear_table()
-        self.weights = lanczos_weights()
         self._survey = survey
         self._optics: dict[str, CameraOptics] = {}
         self._channels: dict[str, tuple[CameraOptics, ...]] = {}
-        self._kept: dict[str, NDArray[np.uint8]] = {}
 
     def optics(self, view: View) -> CameraOptics:
         """Optics of a view's camera (its green channel)."""
@@ -95,17 +89,6 @@ class Tools:
             self._channels[view.camera] = channel_optics(warp, water, self._survey.scaled)
         return self._channels[view.camera]
 
-    def picture(self, image: str) -> NDArray[np.uint8]:
-        """A picture as taken; the last few stay in memory."""
-        if image in self._kept:
-            self._kept[image] = self._kept.pop(image)  # now the last to go
-            return self._kept[image]
-        taken = self._pictures.as_taken(image)
-        while len(self._kept) >= max(1, _CACHED_BYTES // taken.nbytes):
-            del self._kept[next(iter(self._kept))]
-        self._kept[image] = taken
-        return taken
-
 
 @lru_cache(maxsize=1)
 def tools_of(survey: MosaicSetup) -> Tools:
@@ -122,7 +105,7 @@ _MAX_CHANGE = 3.0
 _AROUND = np.ones((9, 9), np.uint8)
 """Cells around those of a view in which it is sampled: as far as the broadest band reaches."""
 _REACHED = np.ones((9, 9), np.uint8)
-"""Pixels of a picture that the kernel of `sample_lanczos` reaches."""
+"""Pixels of a picture beyond which one shows in `sample_spline` by less than 0.5 %."""
 _SHARP = (0.4, 1.1)
 """Least and largest factor of quality for a picture less or more sharp than the median one."""
 
@@ -537,21 +520,13 @@ def _colours(
 ) -> Float32:
     """Corrected colours of a view at the pixels of a box, levels, BGR."""
     view, (local, part, requested) = entry.view, at
-    picture = tools.picture(view.image)
-    light = np.zeros((*sight.quality.shape, 3), np.float32)
     x = np.where(sight.quality > 0, sight.x, np.float32(-1))
-    channels = tools.channels(view)
-    if channels is None:
-        sample_lanczos(picture, tools.table, tools.weights, x, sight.y, 0, 3, light)
-    else:
-        for channel, optics in enumerate(channels):
-            own = see(view, optics, local, (requested, CELL_PX))
-            seen = (own.quality > 0) & (sight.quality > 0)
-            own_x = np.where(seen, own.x, x)
-            own_y = np.where(seen, own.y, sight.y)
-            sample_lanczos(
-                picture, tools.table, tools.weights, own_x, own_y, channel, channel + 1, light
-            )
+    channels = [(x, sight.y)]
+    for optics in tools.channels(view) or ():
+        own = see(view, optics, local, (requested, CELL_PX))
+        seen = (own.quality > 0) & (sight.quality > 0)
+        channels.append((np.where(seen, own.x, x), np.where(seen, own.y, sight.y)))
+    light = _light_at(tools.picture(view.image), tools.table, channels)
     places = sight.places(tools.optics(view).size_px)
     light = task.colour.correct(light, view.camera, view.image, places, sight.range)
     if change is not None:  # bilinear between the centres of cells
@@ -563,6 +538,28 @@ def _colours(
         at = np.meshgrid(columns.astype(np.float32), rows.astype(np.float32))
         light *= cv2.remap(factor, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return task.colour.levels(light)
+
+
+def _light_at(
+    picture: NDArray[np.uint8], table: Float32, at: Sequence[tuple[Float32, Float32]]
+) -> Float32:
+    """Linear light (h, w, 3) at columns and rows (h, w), of all channels and then of each.
+
+    It is 0 where the first columns are negative. Only the part of the picture around is worked on.
+    """
+    wanted = at[0][0] >= 0
+    light = np.zeros((*wanted.shape, 3), np.float32)
+    if wanted.any():
+        ends = [np.array([axis[wanted] for axis in axes]) for axes in zip(*at, strict=True)]
+        low = [max(0, int(axis.min()) - SPLINE_REACH - 1) for axis in ends]
+        high = [int(axis.max()) + SPLINE_REACH + 3 for axis in ends]
+        part = picture[low[1] : high[1], low[0] : high[0]]
+        nodes = spline_nodes(cv2.LUT(part, table))
+        for n, (x, y) in enumerate(at[1:] or at):
+            first, last = (0, 3) if len(at) == 1 else (n, n + 1)
+            x = np.where(wanted, x - np.float32(low[0]), np.float32(-1))
+            sample_spline(nodes, x, y - np.float32(low[1]), first, last, light)
+    return np.maximum(light, np.float32(0))
 
 
 def _inner(block: Block, side_px: int = CELL_PX) -> tuple[slice, slice]:

@@ -450,10 +450,6 @@ def see(
     return SeenCells(*found)
 
 
-_TAPS = 8
-_FRACTIONS = 1024
-
-
 @compiled(error_model="numpy", fastmath=FAST)
 def visible_cells(
     height: Float32,
@@ -611,58 +607,3 @@ def look_up(
             quality[row, column] = inset / half * cosine / (distance * distance)
             ranges[row, column] = distance
     return x, y, quality, ranges
-
-
-def lanczos_weights() -> Float32:
-    """(fractions, taps) of Lanczos' kernel of 4 lobes, each row with the sum 1.
-
-    Row n is for a place n / fractions beyond the fourth of the eight samples.
-    """
-    fraction = np.arange(_FRACTIONS + 1) / _FRACTIONS
-    offset = fraction[:, None] - (np.arange(_TAPS) - (_TAPS // 2 - 1))
-    weights = np.sinc(offset) * np.sinc(offset / (_TAPS // 2))
-    return np.asarray((weights / weights.sum(axis=1, keepdims=True)).astype(np.float32))
-
-
-@compiled
-def sample_lanczos(
-    picture: NDArray[np.uint8], table: Float32, weights: Float32, x: Float32, y: Float32,
-    first: int, last: int, out: Float32,
-) -> None:  # fmt: skip
-    """Values of a picture at places, linear light, by Lanczos' kernel; edges are repeated.
-
-    `cv2.remap` rounds places to 1/32 px; this one to 1/1024.
-
-    Args:
-        picture: (H, W, 3).
-        table: (256,) light of each level.
-        weights: `lanczos_weights`.
-        x: (h, w) columns, the first pixel's centre is 0; negative where nothing is wanted.
-        y: (h, w) rows.
-        first: channel to start with.
-        last: channel before which to stop.
-        out: (h, w, 3), changed in place in those channels where something is wanted.
-    """
-    rows, columns = x.shape
-    high, wide = picture.shape[0] - 1, picture.shape[1] - 1
-    steps = weights.shape[0] - 1
-    lines, places = np.empty(_TAPS, np.int64), np.empty(_TAPS, np.int64)
-    for row in range(rows):
-        for column in range(columns):
-            px, py = x[row, column], y[row, column]
-            if px < 0.0:
-                continue
-            left, top = int(px), int(py)
-            across = weights[int((px - left) * steps + np.float32(0.5))]
-            down = weights[int((py - top) * steps + np.float32(0.5))]
-            for n in range(_TAPS):
-                lines[n] = min(max(top + n - (_TAPS // 2 - 1), 0), high)
-                places[n] = min(max(left + n - (_TAPS // 2 - 1), 0), wide)
-            for channel in range(first, last):
-                total = np.float32(0.0)
-                for j in range(_TAPS):
-                    one = np.float32(0.0)
-                    for i in range(_TAPS):
-                        one += across[i] * table[picture[lines[j], places[i], channel]]
-                    total += down[j] * one
-                out[row, column, channel] = max(total, np.float32(0.0))

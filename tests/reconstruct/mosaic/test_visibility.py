@@ -3,7 +3,6 @@
 from functools import cache
 
 import numpy as np
-import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from alice_survey.core.frames import BODY_FROM_NADIR_CAM
@@ -16,7 +15,6 @@ from reconstruct.views.model import View
 from reconstruct.views.range_shift import range_shift
 from tests.cameras import flat_port_camera
 from tests.oracles_dense import view_at
-from tests.oracles_mosaic import lanczos_at
 
 TILT = np.deg2rad(2.0)
 CAMERA = flat_port_camera(
@@ -80,22 +78,6 @@ def test_each_channel_is_looked_up_where_its_own_light_falls() -> None:
     assert moved[0] > 0.5
     assert moved[1] == 0
     assert moved[2] > 0.5
-
-
-@pytest.mark.parametrize("seed", [1, 2])
-def test_lanczos_equals_its_definition_inside_and_at_edges(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    picture = rng.integers(0, 256, (20, 24, 3)).astype(np.uint8)
-    table = (np.arange(256) / 255.0).astype(np.float32) ** 2
-    x = rng.uniform(0, 23, (1, 40)).astype(np.float32)
-    y = rng.uniform(0, 19, (1, 40)).astype(np.float32)
-    x[0, 0] = -1
-    found = np.full((1, 40, 3), -7, np.float32)
-    visibility.sample_lanczos(picture, table, visibility.lanczos_weights(), x, y, 0, 3, found)
-    assert (found[0, 0] == -7).all()
-    light = table[picture].astype(float)
-    expected = np.stack([lanczos_at(light, a, b) for a, b in zip(x[0], y[0], strict=True)])
-    np.testing.assert_allclose(found[0, 1:], expected[1:], atol=4e-3)
 
 
 def test_forgetting_the_range_would_show() -> None:

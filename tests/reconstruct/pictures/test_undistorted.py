@@ -4,11 +4,18 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from scipy.ndimage import map_coordinates
 
 from alice_survey.core.artefacts import write_json
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from reconstruct.mapping.self_calibration import self_calibrated_warp
-from reconstruct.pictures.undistorted import Pictures, undistortion_maps
+from reconstruct.pictures.undistorted import (
+    Pictures,
+    sample_spline,
+    show_at,
+    spline_nodes,
+    undistortion_maps,
+)
 from reconstruct.views.model_files import colmap_pinhole
 from tests.cameras import flat_port_camera
 
@@ -31,6 +38,34 @@ def opencv_lens(k1: float = -0.3) -> PinholeWarp:
             params=[280.0, 282.0, 161.0, 118.0, k1, 0.1, 1e-3, 5e-4],
         )
     )  # fmt: skip
+
+
+def test_samples_equal_those_of_another_spline_inside_and_at_edges() -> None:
+    rng = np.random.default_rng(1)
+    picture = rng.integers(0, 256, (20, 24, 3)).astype(np.uint8)
+    x, y = (rng.uniform(0, last, (1, 60)).astype(np.float32) for last in (23, 19))
+    x[0, :3], y[0, 3:5], x[0, 5:7] = -1, (0, 19), (0, 23)
+    found = np.full((1, 60, 3), -7, np.float32)
+    sample_spline(spline_nodes(picture), x, y, 1, 3, found)
+    assert (found[0, :3] == -7).all()
+    assert (found[..., 0] == -7).all()
+    for k in (1, 2):
+        expected = map_coordinates(picture[..., k].astype(float), (y[0], x[0]), mode="mirror")
+        np.testing.assert_allclose(found[0, 3:, k], expected[3:], atol=0.02)
+
+
+@pytest.mark.parametrize("wave_px", [4, 6, 12])
+def test_turned_waves_come_out_better_than_by_lanczos(wave_px: float) -> None:
+    def wave(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        turns = (np.cos(k) * x + np.sin(k) * y for k in (0.3, 1.4, 2.6))
+        return 128 + 25 * np.sum([np.cos(2 * np.pi / wave_px * turn) for turn in turns], axis=0)
+
+    y, x = np.mgrid[:200, :200].astype(np.float32)
+    taken = np.repeat(np.rint(wave(x, y))[..., None], 3, axis=2).astype(np.uint8)
+    at = 0.95 * x + 0.03 * y + 2.3, 0.94 * y - 0.03 * x + 7.1
+    found = show_at(taken, *at), cv2.remap(taken, *at, cv2.INTER_LANCZOS4)
+    errors = [np.std((shown[..., 0] - wave(*at))[10:-10, 10:-10]) for shown in found]
+    assert 12**-0.5 < errors[0] < errors[1]
 
 
 LENSES = pytest.mark.parametrize("lens", [port_lens(), opencv_lens()], ids=["port", "opencv"])
