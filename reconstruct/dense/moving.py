@@ -183,7 +183,8 @@ def keep_look(task: ViewTask) -> None:
     h, w = height // step, width // step
     colour = store.load_colour(index)
     factors = cv2.resize(store.load(0, FACTORS)[index], (width, height))
-    valid = store.load_mask(index, PICTURE, "valid", width) & (colour.max(axis=2) > _DARKEST)
+    valid = store.load_mask(index, PICTURE, "valid", width)
+    valid &= cv2.inRange(colour, (0,) * 3, (_DARKEST,) * 3) == 0
     depth, _ = store.load_depth(index, "fine")
     depth[~store.load_mask(index, CHECKED, "kept", width)] = np.nan
     part = slice(0, h * step), slice(0, w * step)
@@ -215,7 +216,9 @@ def moving_parts(look: Look, others: Sequence[Look]) -> tuple[Mask, float]:
         (h / 2, w / 2) mask, and the share of the cells that could be compared.
     """
     fewer = look.every_other
-    still = still_depth(fewer, [other.every_other for other in others])
+    drawn = np.array([draw(other.every_other, fewer) for other in others], np.float32)
+    at = np.array([other.view.station for other in others], np.int64)
+    still = shared_depth(drawn.reshape(-1, *fewer.shape), at, _SAME_DEPTH)
     rows, columns = np.nonzero(np.isfinite(still) & fewer.usable)
     nothing = np.zeros(still.shape, np.bool_)
     depth = still[rows, columns]
@@ -249,13 +252,6 @@ def moving_parts(look: Look, others: Sequence[Look]) -> tuple[Mask, float]:
     return found, float(compared.mean())
 
 
-def still_depth(look: Look, others: Sequence[Look]) -> Float32:
-    """Depth (h, w) of the surface on which two or more other stations agree; NaN where none."""
-    stack = np.array([draw(other, look) for other in others]).reshape(-1, *look.shape)
-    stations = np.array([other.view.station for other in others], np.int64)
-    return shared_depth(stack.astype(np.float32), stations, _SAME_DEPTH)
-
-
 def draw(look: Look, onto: Look) -> Array:
     """Draw the surface of a view into another, each cell into the four around it, the nearest last.
 
@@ -269,15 +265,17 @@ def draw(look: Look, onto: Look) -> Array:
     height, width = onto.shape
     inside = (x >= -1) & (x < width) & (y >= -1) & (y < height)
     cell = ((y[inside] + 1) * (width + 1) + x[inside] + 1).astype(np.int64)
-    found = np.full((height + 1) * (width + 1), np.inf)
-    np.minimum.at(found, cell, depth[inside])  # of cells whose right and lower ones are drawn too
-    found = np.minimum(*(found.reshape(height + 1, -1)[n : n + height] for n in range(2)))
+    found = np.full((height + 1, width + 1), np.inf)
+    np.minimum.at(found.reshape(-1), cell, depth[inside])  # each stands for the four around
+    found = np.minimum(found[:-1], found[1:])
     found = np.minimum(found[:, :-1], found[:, 1:])
     return np.where(np.isfinite(found), found, np.nan)
 
 
 def shared_depth(stack: Float32, stations: NDArray[np.int64], tolerance: float) -> Float32:
     """The nearest depth of each cell that views of two or more stations share.
+
+    It is that of a surface which stays. Where there is none it is NaN.
 
     Args:
         stack: (K, h, w) depths, NaN where unknown.

@@ -21,12 +21,11 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from alice_survey.core.block_solver import MAD_TO_SIGMA
 from alice_survey.core.compiled import compiled
 from alice_survey.core.frames import Array
-from reconstruct.pictures.undistorted import spline_weights
+from reconstruct.pictures.undistorted import spline_nodes, spline_weights
 from reconstruct.views.model import View
 from reconstruct.views.range_shift import FAST, KernelLens, line_of, warped_at
 
@@ -84,16 +83,11 @@ def prepare(
     grey: NDArray[np.uint8], valid: NDArray[np.bool_]
 ) -> tuple[Float32, Float32, NDArray[np.bool_]]:
     """Contrast, spline and validity of a picture (H, W), as `ComparedView` has them."""
-    contrast = even_contrast(grey.astype(np.float32))
-    spline = ndimage.spline_filter(contrast, order=3, output=np.float32, mode="mirror")
-    return contrast, spline, valid
-
-
-def even_contrast(grey: Float32) -> Float32:
-    """A picture minus its local mean, over its local deviation."""
-    rest: Float32 = grey - _level(grey)
+    level = grey.astype(np.float32)
+    rest: Float32 = level - _level(level)
     variance = _level(rest * rest) + np.float32(_MIN_CONTRAST**2)
-    return rest * (variance ** np.float32(-0.5))
+    contrast = rest * (variance ** np.float32(-0.5))
+    return contrast, spline_nodes(contrast), valid
 
 
 def _level(picture: Float32) -> Float32:

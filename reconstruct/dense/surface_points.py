@@ -161,21 +161,25 @@ def robust_height(
     half = 0.0
     for i in range(heights.size):
         half += 0.5 / sigmas[i] ** 2
-    median_at, below = order[-1], 0.0
-    for i in order:
-        below += 1.0 / sigmas[i] ** 2
-        if below >= half:
-            median_at = i
-            break
+    rank, below = 0, 1.0 / sigmas[order[0]] ** 2
+    while below < half and rank < heights.size - 1:
+        rank += 1
+        below += 1.0 / sigmas[order[rank]] ** 2
+    median_at = order[rank]
     median = heights[median_at]
-    residuals = np.empty(heights.size, np.float32)
-    for i in range(heights.size):
-        residuals[i] = abs(heights[i] - median)
-    ranks = sorted_ranks(residuals)
-    middle = heights.size // 2
-    scatter = MAD_TO_SIGMA * residuals[ranks[middle]]
+    low, high, middle, before = rank, rank + 1, 0.0, 0.0  # residuals rise both ways from it
+    for _ in range(heights.size // 2 + 1):
+        before = middle
+        upper = np.inf if high == heights.size else heights[order[high]] - median
+        if low >= 0 and median - heights[order[low]] <= upper:
+            middle = median - heights[order[low]]
+            low -= 1
+        else:
+            middle = upper
+            high += 1
+    scatter = MAD_TO_SIGMA * middle
     if heights.size % 2 == 0:
-        scatter = 0.5 * (scatter + MAD_TO_SIGMA * residuals[ranks[middle - 1]])
+        scatter = 0.5 * (scatter + MAD_TO_SIGMA * before)
     reach = gate * max(scatter, sigmas[median_at])
     total, weights, squares = 0.0, 0.0, 0.0
     formal, in_view, view_weight, seen, last_view = 0.0, 0, 0.0, 0, -1

@@ -351,7 +351,7 @@ def _lay_out(
     ends = [_BOUND_PERCENT, 100 - _BOUND_PERCENT]
     if len(points):
         low, high = np.transpose([np.percentile(points[:, k].copy(), ends) for k in range(2)])
-        inside[kept] = ((points[:, :2] >= low) & (points[:, :2] <= high)).all(axis=1)
+        inside[kept] = np.logical_and(*((points[:, :2] >= low) & (points[:, :2] <= high)).T)
     blocks, masks = block_bounds(kept, points), (pack_mask(kept), pack_mask(inside))
     task.store.save(task.index, CHECKED, pack(kept=masks[0], inside=masks[1], blocks=blocks))
     if not len(points):

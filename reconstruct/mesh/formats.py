@@ -162,7 +162,7 @@ def _shade(
     face = hit["primitive_ids"].numpy()[seen].astype(np.int64)
     share = hit["primitive_uvs"].numpy()[seen].astype(np.float64)
     weights = np.column_stack([1 - share.sum(axis=1), share])
-    uv = (mesh.uv[mesh.wedges.triangles[face]] * weights[..., None]).sum(axis=1)
+    uv = np.einsum("nkc,nk->nc", mesh.uv[mesh.wedges.triangles[face]], weights)
     colour = np.full((len(rays), 3), _BACK, np.float32)
     light = np.array([-0.35, 0.35, 0.87])
     lit = np.clip(0.55 + 0.5 * np.abs(normals[face] @ light), 0.0, 1.05)

@@ -71,7 +71,7 @@ def read_mask(path: Path, size: tuple[int, int]) -> Mask:
 
 
 def spline_nodes(picture: NDArray[Any]) -> Float32:
-    """Coefficients of the cubic B-spline through a picture (H, W, 3), mirrored at its edges."""
+    """Coefficients of the cubic B-spline through a picture (H, W, ...), mirrored at its edges."""
     kernel = _TO_NODES / _TO_NODES.sum()
     nodes = cv2.sepFilter2D(picture, cv2.CV_32F, kernel, kernel, borderType=cv2.BORDER_REFLECT_101)
     return np.asarray(nodes, np.float32)
