@@ -40,6 +40,8 @@ from alice_survey.core.run import progress
 from camera_calib.approximation.pinhole_warp import PinholeWarp, best_warp
 from camera_calib.freedom import POSE as TURN_AND_SHIFT
 from camera_calib.freedom import Prior, at_bound, move_rig, part_of_rig, pose_names, value
+from camera_calib.lenses.fisheye import FisheyeLens
+from camera_calib.lenses.opencv import OpenCVLens
 from camera_calib.rig import Covariance, Rig
 from reconstruct.adjustment.exact_observations import (
     ALONE,
@@ -75,19 +77,22 @@ from reconstruct.mapping.mapper import Mapped, model_baseline
 from reconstruct.mapping.refraction import Keypoints
 from reconstruct.views.model_files import colmap_pinhole, rigid3d, stored_of
 
-BIAS_PX = 0.04
-"""Sigma of the shift of keypoints, root mean square over a picture: 0.006 for each polynomial. In
-rendered surveys the largest of these are 0.001 behind flat ports and 0.007 with a fisheye, where a
-line is flown again in the other direction and the lamps come from the other side."""
+BIAS_PX = {OpenCVLens.model: 0.01, FisheyeLens.model: 0.04}
+"""Sigma of the shift of keypoints by lens, root mean square over a picture: 0.0015 and 0.006 for
+each polynomial. In rendered surveys the largest of these are 0.001 behind flat ports and 0.007 with
+a fisheye, where a line is flown again in the other direction and the lamps come from the other
+side."""
 
 
 def shift_information(state: RigState) -> Array:
     """What is known before the pictures of the shifts of a state, as a matrix (S, S).
 
-    All are equally likely, which makes `BIAS_PX` squared the expected mean square over the picture.
+    All of a camera are equally likely, which makes the square of its `BIAS_PX` the expected mean
+    square over the picture.
     """
-    cameras = max(1, len(state.shifts))
-    return np.eye(state.shifts.size) * state.shifts.size / cameras / BIAS_PX**2
+    count = state.shifts[:1].size
+    lenses = [camera.lens.model for camera in state.rig.cameras.values()]
+    return np.diag(np.repeat([count / BIAS_PX[lens] ** 2 for lens in lenses], count))
 
 
 _MEASURED = 0.05
@@ -387,9 +392,8 @@ class SurveyProblem:
         """Half of the robust loss and prior."""
         if guess.lost > self.start.lost:
             return math.inf
-        sigma, variance = noise
         off = self.misfit(guess.state)
-        pixels = robust_cost(guess.miss, sigma) / variance
+        pixels = robust_cost(guess.miss, noise[0]) / noise[1]
         return 0.5 * float(pixels + off @ self.information @ off)
 
     def linearise(self, guess: _Guess, noise: Array) -> PointEquations:
