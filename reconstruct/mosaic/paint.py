@@ -547,17 +547,17 @@ def _light_at(
 
     It is 0 where the first columns are negative. Only the part of the picture around is worked on.
     """
-    wanted = at[0][0] >= 0
-    light = np.zeros((*wanted.shape, 3), np.float32)
-    if wanted.any():
-        ends = [np.array([axis[wanted] for axis in axes]) for axes in zip(*at, strict=True)]
+    inside = at[0][0] >= 0
+    light = np.zeros((*inside.shape, 3), np.float32)
+    if inside.any():
+        ends = [np.array([axis[inside] for axis in axes]) for axes in zip(*at, strict=True)]
         low = [max(0, int(axis.min()) - SPLINE_REACH - 1) for axis in ends]
         high = [int(axis.max()) + SPLINE_REACH + 3 for axis in ends]
         part = picture[low[1] : high[1], low[0] : high[0]]
         nodes = spline_nodes(cv2.LUT(part, table))
         for n, (x, y) in enumerate(at[1:] or at):
             first, last = (0, 3) if len(at) == 1 else (n, n + 1)
-            x = np.where(wanted, x - np.float32(low[0]), np.float32(-1))
+            x = np.where(inside, x - np.float32(low[0]), np.float32(-1))
             sample_spline(nodes, x, y - np.float32(low[1]), first, last, light)
     return np.maximum(light, np.float32(0))
 
