@@ -31,7 +31,7 @@ WORDS = Path(__file__).with_name("structure_words.toml")
 """Words that are not used, and where each of them counts."""
 BOUNDS = {
     "code lines of the packages": 71_436,  # 69,438, and a part of the reserve of 2,000
-    "code lines of the tests": 52_080,  # 48,310, and a part of the reserve of 4,000
+    "code lines of the tests": 52_086,  # 48,310, and a part of the reserve of 4,000
     "code lines of the benchmarks": 7_973,
     "lines of our own JavaScript": 4_896,
     "modules": 393,

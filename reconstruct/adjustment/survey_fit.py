@@ -99,8 +99,10 @@ _MEASURED = 0.05
 """Share of the prior variance that pictures take away, from which a direction is measured."""
 _UNLIKELY = 1e-4
 """Probability of the whole pull, if the calibration were right, below which it is named."""
+_CHANCE = 0.02
+"""Probability that the most moved of so many parameters moves as far, above which none is named."""
 _FAR = 2.0
-"""Prior sigmas from which a parameter is named."""
+"""Prior sigmas from which a parameter is named next to the most moved."""
 _MAX_NAMED = 4
 
 
@@ -146,11 +148,11 @@ def contradiction(
     measured = gain > _MEASURED
     along = directions[:, measured].T @ (white @ change)
     total = float((along**2 / gain[measured]).sum())
-    count = int(measured.sum())
-    pulls = change / sigmas
+    count, pulls = int(measured.sum()), change / sigmas
     far = [int(k) for k in np.argsort(-np.abs(pulls)) if abs(pulls[k]) > _FAR][:_MAX_NAMED]
     # Parameters that go together are known to thousandths of a pixel: alone that shows nothing.
-    if count == 0 or not far or chdtrc(count, total) > _UNLIKELY:
+    by_chance = len(pulls) * chdtrc(1, (pulls**2).max()) > _CHANCE
+    if count == 0 or by_chance or chdtrc(count, total) > _UNLIKELY:
         return None
     named = {parameters[k]: float(pulls[k]) for k in far}
     return Contradiction(chi_square=total, directions=count, pulls=named)
@@ -302,7 +304,6 @@ def fit_survey(
         known = inverse_of(calibrated_information(guess.state, fields))
         equations = problem.reduce(guess, found.noise, fields)
     sigma_px, variance = found.noise.tolist()
-    weights = robust_weights(guess.miss, sigma_px)
     prior_covariance = inverse_of(problem.information)[own, own]
     change = np.array([value(guess.state.rig, name) for name in problem.fields]) - before
     against = contradiction(problem.fields, change, prior_covariance, covariance)
@@ -316,7 +317,7 @@ def fit_survey(
         prior_covariance=prior_covariance,
         covariance=wider * covariance,
         calibration=motions_of(equations, guess.state.points, wider * known) if fields else None,
-        sigma_px=float(np.sqrt(variance / weights.mean())),
+        sigma_px=float(np.sqrt(variance / robust_weights(guess.miss, sigma_px).mean())),
         observations=len(pixels.station),
         contradiction=against,
     )

@@ -411,6 +411,15 @@ def test_a_wrong_parameter_is_found_and_named():
     assert all(3 <= one.directions <= 4 for one in known)
 
 
+@pytest.mark.parametrize(("most", "is_named"), [(2.5, False), (4.5, True)])
+def test_what_one_of_many_parameters_moves_by_chance_is_not_named(most: float, is_named: bool):
+    """Of 60 parameters one moves by 2.5 sigmas every other time; their mean is known too well."""
+    prior = np.eye(60) - (1.0 - 1e-6) / 60
+    change = np.eye(60)[7] * most + 0.05 / np.sqrt(60)
+    found = contradiction([f"p{n}" for n in range(60)], change, prior, 1e-9 * np.eye(60))
+    assert (found is not None and next(iter(found.pulls)) == "p7") == is_named
+
+
 def test_nothing_free_contradicts_nothing():
     assert contradiction((), np.empty(0), np.empty((0, 0)), np.empty((0, 0))) is None
     assert contradiction(NAMES, np.zeros(6), np.eye(6), np.eye(6)) is None
