@@ -97,8 +97,8 @@ def main_settings(plan_json: dict[str, Any]) -> str:
     table = text_table(("setting", "value", "bound by"), [shown[n] for n in _MAIN if n in shown])
     return (
         f"{table}\nSeveral values: over the top / mean / bottom of the relief; of overlaps at the "
-        "mean /\nover the top / there with lines off track; of signal to noise in red / green / blue.\n"
-        "Equations: plan/settings.txt, or --all\n"
+        "mean / over the\ntop / there with lines off track; of signal to noise in red / green / "
+        "blue. Equations:\nplan/settings.txt, or --all\n"
     )
 
 
