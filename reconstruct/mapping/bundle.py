@@ -8,8 +8,7 @@ to the next: a few in a hundred miss by many sigmas, and not at random, since la
 cameras go. With equal weights they bend a block by more than all other noise together. Cauchy's
 loss (Rey 1983, "Introduction to robust and quasi-robust statistical methods") lets them go by and
 costs almost nothing where errors are normal. The last adjustment, which begins near its end, takes
-that of Geman and McClure (1987), whose pull falls to nothing: under Cauchy's, shadows moved an
-exact rig with a fisheye by up to 5 sigmas.
+that of Geman and McClure (1987), whose pull falls to nothing (`reconstruct.adjustment`).
 
 Poses of a few thousand keypoints a picture are as good from a few hundred that are spread over it,
 those of the longest tracks first; the adjustment then takes a fraction of the time and memory. The
